@@ -1,0 +1,1 @@
+# messages, services, dynamic_reconfigure, catkin_package
