@@ -1,0 +1,193 @@
+/// \file
+/// Dynamic voxel grid (METHOD 1; thesis 3.1): incremental downsampling with stable handles and neighbours from the grid itself.
+#pragma once
+
+#include <array>
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <memory>
+#include <vector>
+
+#include "incremental_segmatch/types.hpp"
+
+namespace incremental_segmatch {
+
+struct DynamicVoxelGridParameters {
+  double resolution_m = 0.1;                      ///< side of a voxel
+  int min_points_per_voxel = 1;                   ///< a voxel is active, and goes downstream, from this many points on
+  std::array<int, 3> bits{21, 21, 21};            ///< of the index, per axis (3.1); 21 bits of 0.1 m span 209 km
+  std::array<double, 3> center_m{0.0, 0.0, 0.0};  ///< o of (3.3): centre of the covered volume, in the grid's frame
+};
+
+/// A voxel whose centroid moved. Coordinates are relative to the corner of the voxel's block (DynamicVoxelGrid::BlockCorner).
+struct MovedVoxel {
+  VoxelHandle voxel = 0;
+  Eigen::Vector3f before_block = Eigen::Vector3f::Zero();
+  Eigen::Vector3f after_block = Eigen::Vector3f::Zero();
+};
+
+/// A voxel that left. Its handle is free from the next call of the grid on.
+struct RemovedVoxel {
+  VoxelHandle voxel = 0;
+  Eigen::Vector3f centroid_block = Eigen::Vector3f::Zero();
+};
+
+/// What one call changed, among active voxels only; the three lists are disjoint. Apply it to every consumer before the
+/// grid is called again: handles of removed voxels are reused then.
+struct VoxelUpdate {
+  std::vector<VoxelHandle> activated;  ///< reached min_points_per_voxel in this call
+  std::vector<MovedVoxel> moved;       ///< were active before, and got points
+  std::vector<RemovedVoxel> removed;   ///< were active and are gone
+  std::size_t dropped_nonfinite = 0;   ///< points with a NaN or infinite coordinate
+  std::size_t dropped_outside = 0;     ///< points outside the covered volume
+};
+
+/// Cells of the neighbourhood of a radius, prepared once: for each of the 64 cells of a block, which neighbouring blocks to
+/// visit and which of their cells can hold a point within the radius.
+class NeighbourStencil {
+ public:
+  /// Throws std::invalid_argument unless 0 < radius_m <= 16 resolution_m.
+  NeighbourStencil(double radius_m, double resolution_m);
+
+  struct BlockVisit {
+    std::array<std::int8_t, 3> offset{};  ///< in blocks
+    std::int16_t link = -1;               ///< index of an adjacent block's link, -1 if it must be looked up
+    std::uint64_t cells = 0;              ///< candidates within that block
+  };
+  const std::vector<BlockVisit>& visits(unsigned cell) const { return visits_[cell]; }
+  double radius_m() const { return radius_m_; }
+
+ private:
+  double radius_m_;
+  std::array<std::vector<BlockVisit>, 64> visits_;
+};
+
+/// Voxels in blocks of 4 x 4 x 4 cells, the blocks in a hash map with links to their 26 neighbours. A voxel's handle is
+/// block slot * 64 + cell: stable for the voxel's life. Centroids are stored in float relative to their block, so that
+/// accuracy does not depend on the distance from the origin.
+///
+/// Everything is kept in the grid's own frame; T_odom_grid (T_g of the thesis) maps it to the world, so that a rigid
+/// transform of the whole grid (3.1.4) is one matrix product, and a later point still finds its voxel.
+///
+/// Cost: Insert is O(points), RemoveOutside O(removed + tiles of 3.2 m in the map), Transform O(1), neighbours
+/// O(voxels in the stencil). Not thread-safe.
+class DynamicVoxelGrid {
+ public:
+  static constexpr int kBlockSide = 4;             ///< cells along a block's side
+  static constexpr VoxelHandle kCellsPerBlock = 64;
+
+  /// Throws std::invalid_argument naming the parameter that is out of range.
+  explicit DynamicVoxelGrid(const DynamicVoxelGridParameters& parameters);
+  ~DynamicVoxelGrid();
+  DynamicVoxelGrid(DynamicVoxelGrid&&) noexcept;
+  DynamicVoxelGrid& operator=(DynamicVoxelGrid&&) noexcept;
+
+  /// Inserts points (3.2-3.4): c <- (n c + sum p) / (n + m), n <- n + m. Points that are not finite or lie outside the
+  /// covered volume are dropped and counted.
+  VoxelUpdate Insert(const Points& points_sensor, const Pose& T_odom_sensor);
+
+  /// Removes whole voxels whose centroid is farther than the radius from the centre, measured in the grid's x-y plane.
+  VoxelUpdate RemoveOutside(const Eigen::Vector3d& center_odom, double radius_m);
+
+  /// Rigid transform of everything: T_g <- T_new_old T_g.
+  void Transform(const Pose& T_new_old) { T_odom_grid_ = T_new_old * T_odom_grid_; }
+
+  const Pose& T_odom_grid() const { return T_odom_grid_; }
+  const DynamicVoxelGridParameters& parameters() const { return parameters_; }
+  std::size_t active_voxels() const { return active_voxels_; }
+  std::size_t occupied_voxels() const { return occupied_voxels_; }
+  /// One more than the largest handle that was ever given out: the size of a consumer's array over handles.
+  std::size_t handle_capacity() const;
+  /// Bytes held by the grid.
+  std::size_t memory_bytes() const;
+
+  bool IsActive(VoxelHandle voxel) const;
+  std::uint32_t PointCount(VoxelHandle voxel) const;
+  /// Lower corner of the block that the voxel belongs to, in the grid's frame (exact multiples of 4 cells).
+  Eigen::Vector3d BlockCorner(VoxelHandle voxel) const;
+  /// Centroid relative to BlockCorner.
+  const Eigen::Vector3f& CentroidInBlock(VoxelHandle voxel) const;
+  /// Centroid in the grid's frame.
+  Eigen::Vector3d CentroidGrid(VoxelHandle voxel) const { return BlockCorner(voxel) + CentroidInBlock(voxel).cast<double>(); }
+  Eigen::Vector3d CentroidOdom(VoxelHandle voxel) const { return T_odom_grid_ * CentroidGrid(voxel); }
+
+  /// Handles of all active voxels, block by block. O(local cloud): for inspection, not for a step.
+  std::vector<VoxelHandle> ActiveVoxels() const;
+
+  /// Calls visit(neighbour, difference) for each active voxel other than this one whose centroid lies within the
+  /// stencil's radius; difference = centroid of the neighbour minus this voxel's. visit returns false to stop.
+  template <class Visit>
+  void ForEachNeighbour(const NeighbourStencil& stencil, VoxelHandle voxel, Visit&& visit) const;
+
+ private:
+  static constexpr std::uint32_t kNoBlock = 0xffffffffu;
+  struct Voxel {
+    Eigen::Vector3f centroid_block;
+    std::uint32_t count;
+  };
+  struct Block {
+    std::uint64_t occupied = 0;  ///< cells with at least one point
+    std::uint64_t active = 0;    ///< cells with at least min_points_per_voxel
+    std::uint64_t touched = 0;   ///< cells that got points in the running Insert
+    std::array<std::int32_t, 3> coordinates{};
+    std::uint32_t tile = 0;
+    std::uint32_t position_in_tile = 0;
+    std::array<std::uint32_t, 27> links{};
+    std::array<Voxel, kCellsPerBlock> voxels;
+  };
+  static constexpr std::uint32_t kBlocksPerPage = 256;
+  class BlockMap;
+  class TileMap;
+
+  Block& block(std::uint32_t slot) { return pages_[slot / kBlocksPerPage][slot % kBlocksPerPage]; }
+  const Block& block(std::uint32_t slot) const { return pages_[slot / kBlocksPerPage][slot % kBlocksPerPage]; }
+  std::uint32_t FindBlock(const std::array<std::int32_t, 3>& coordinates) const;
+  std::uint32_t AddBlock(const std::array<std::int32_t, 3>& coordinates);
+  void RemoveBlock(std::uint32_t slot);
+  void RemoveCells(std::uint32_t slot, std::uint64_t cells, VoxelUpdate* update);
+
+  DynamicVoxelGridParameters parameters_;
+  float block_size_m_ = 0.f;
+  Pose T_odom_grid_ = Pose::Identity();
+  std::vector<std::unique_ptr<Block[]>> pages_;
+  std::uint32_t block_slots_ = 0;            ///< slots ever used
+  std::vector<std::uint32_t> free_blocks_;
+  std::unique_ptr<BlockMap> block_map_;
+  std::unique_ptr<TileMap> tiles_;
+  std::size_t active_voxels_ = 0;
+  std::size_t occupied_voxels_ = 0;
+
+  struct Touched {
+    VoxelHandle voxel;
+    bool was_active;
+    Eigen::Vector3f before_block;
+  };
+  std::vector<Touched> touched_;             ///< work space of Insert
+};
+
+template <class Visit>
+void DynamicVoxelGrid::ForEachNeighbour(const NeighbourStencil& stencil, VoxelHandle voxel, Visit&& visit) const {
+  const Block& home = block(voxel / kCellsPerBlock);
+  const unsigned cell = voxel % kCellsPerBlock;
+  const Eigen::Vector3f center = home.voxels[cell].centroid_block;
+  const float radius2 = static_cast<float>(stencil.radius_m() * stencil.radius_m());
+  for (const NeighbourStencil::BlockVisit& at : stencil.visits(cell)) {
+    const std::uint32_t slot =
+        at.link >= 0 ? home.links[at.link]
+                     : FindBlock({home.coordinates[0] + at.offset[0], home.coordinates[1] + at.offset[1],
+                                  home.coordinates[2] + at.offset[2]});
+    if (slot == kNoBlock) continue;
+    const Block& other = block(slot);
+    const Eigen::Vector3f shift(at.offset[0] * block_size_m_ - center.x(), at.offset[1] * block_size_m_ - center.y(),
+                                at.offset[2] * block_size_m_ - center.z());
+    for (std::uint64_t cells = other.active & at.cells; cells != 0; cells &= cells - 1) {
+      const unsigned neighbour_cell = static_cast<unsigned>(__builtin_ctzll(cells));
+      const Eigen::Vector3f difference = other.voxels[neighbour_cell].centroid_block + shift;
+      const VoxelHandle neighbour = slot * kCellsPerBlock + neighbour_cell;
+      if (difference.squaredNorm() <= radius2 && neighbour != voxel && !visit(neighbour, difference)) return;
+    }
+  }
+}
+
+}  // namespace incremental_segmatch

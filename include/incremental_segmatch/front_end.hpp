@@ -1,0 +1,108 @@
+/// \file
+/// Robot side: scan and pose to changed, described segments (METHOD 0 to 4).
+#pragma once
+
+#include <string>
+#include <unordered_map>
+#include <vector>
+
+#include "incremental_segmatch/descriptors.hpp"
+#include "incremental_segmatch/dynamic_voxel_grid.hpp"
+#include "incremental_segmatch/ground_filter.hpp"
+#include "incremental_segmatch/incremental_segmenter.hpp"
+#include "incremental_segmatch/segment_delta.hpp"
+#include "incremental_segmatch/stage_times.hpp"
+#include "incremental_segmatch/types.hpp"
+
+namespace incremental_segmatch {
+
+/// When a tracked segment's state is worth a view.
+struct ViewParameters {
+  double growth_factor = 1.2;   ///< a new view once the segment has grown by this factor since its last view
+  double baseline_m = 10.0;     ///< or once it changed and the sensor is this far from where its last view was taken
+};
+
+struct FrontEndParameters {
+  GroundFilterParameters ground;
+  double local_radius_m = 50.0;        ///< of the local map around the sensor, horizontally
+  DynamicVoxelGridParameters grid;
+  SegmenterParameters segmenter;
+  DescriptorParameters descriptor;
+  ViewParameters view;
+};
+
+/// The robot side's part of the funnel.
+struct FrontEndCounts {
+  std::size_t points = 0;             ///< of the scan
+  std::size_t obstacle_points = 0;    ///< that passed the ground filter
+  std::size_t dropped_nonfinite = 0;
+  std::size_t dropped_outside = 0;    ///< outside the volume that the grid covers
+  std::size_t voxels = 0;             ///< active in the local map
+  std::size_t activated_voxels = 0;
+  std::size_t moved_voxels = 0;
+  std::size_t removed_voxels = 0;
+  ClusterCounts clusters;
+};
+
+struct FrontEndStep {
+  SegmentDelta delta;
+  FrontEndCounts counts;
+  StageTimes times;
+};
+
+/// A point of the local map with the segment it belongs to (kNoSegment if none): for people to look at.
+struct LocalPoint {
+  Eigen::Vector3f position_odom;
+  SegmentId segment;
+};
+
+/// One robot's local map. Synchronous; not thread-safe.
+class FrontEnd {
+ public:
+  /// Throws std::invalid_argument naming the parameter that is out of range.
+  FrontEnd(const FrontEndParameters& parameters, std::string robot);
+
+  /// Takes one scan. Throws std::invalid_argument if its stamp is not after the last one's or its pose is not finite: nothing
+  /// has changed then.
+  FrontEndStep Process(const Scan& scan);
+
+  /// The odometry frame jumped (a correction by the SLAM stack): local cloud and segments move along, and tracking goes on. O(1)
+  /// for the cloud; the next delta reports every tracked segment as changed.
+  void ApplyJump(const Pose& T_new_old);
+
+  /// Every tracked segment, as a delta with full_state set, with the sequence number of the last delta.
+  SegmentDelta FullState() const;
+
+  /// The local map's points. O(local cloud).
+  std::vector<LocalPoint> LocalCloud() const;
+
+  const std::string& robot() const { return robot_; }
+  const FrontEndParameters& parameters() const { return parameters_; }
+  const Describer& describer() const { return describer_; }
+  std::size_t memory_bytes() const;
+
+ private:
+  struct Tracked {
+    std::uint32_t view_size = 0;
+    Eigen::Vector3d view_position_odom = Eigen::Vector3d::Zero();
+  };
+
+  SegmentState DescribeSegment(SegmentId segment) const;
+  std::shared_ptr<const Points> SegmentPoints(SegmentId segment, const Eigen::Vector3d& centroid_odom) const;
+  SegmentDelta DescribeChanges(const SegmentUpdate& left, const SegmentUpdate& grown, const Scan& scan);
+
+  FrontEndParameters parameters_;
+  std::string robot_;
+  GroundFilter ground_filter_;
+  DynamicVoxelGrid grid_;
+  IncrementalSegmenter<EuclideanPolicy> segmenter_;
+  Describer describer_;
+  std::unordered_map<SegmentId, Tracked> tracked_;
+  std::uint64_t sequence_ = 0;
+  bool started_ = false;
+  bool jumped_ = false;
+  StampNs last_stamp_ns_ = 0;
+  Pose last_T_odom_sensor_ = Pose::Identity();
+};
+
+}  // namespace incremental_segmatch

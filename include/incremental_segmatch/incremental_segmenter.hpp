@@ -1,0 +1,157 @@
+/// \file
+/// Incremental region growing with segment tracking (METHOD 3; thesis 3.3).
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <utility>
+#include <vector>
+
+#include "incremental_segmatch/dynamic_voxel_grid.hpp"
+#include "incremental_segmatch/growing_policies.hpp"
+#include "incremental_segmatch/segment_moments.hpp"
+#include "incremental_segmatch/types.hpp"
+
+namespace incremental_segmatch {
+
+/// What happens to a segment that the boundary of the local map cuts.
+enum class BoundaryPolicy {
+  kInvalidate,  ///< thesis: it is no segment any more, nor is what merges with it
+  kKeep         ///< it stays a segment until it has left entirely; its sums keep the points that left
+};
+
+struct SegmenterParameters {
+  double growing_radius_m = 0.2;
+  std::size_t min_cluster_size = 100;    ///< voxels; smaller clusters are no segments
+  std::size_t max_cluster_size = 15000;  ///< voxels; larger clusters are no segments
+  BoundaryPolicy boundary = BoundaryPolicy::kKeep;
+};
+
+/// Why tracking of a segment ended; see the table of METHOD 3 for what it means to the target map.
+enum class RetirementCause {
+  kTooLarge,  ///< it was no segment: it leaves the map
+  kCut,       ///< partly left the local map (kInvalidate), or merged with such a cluster: its views stay
+  kLeft       ///< all its points have left the local map: its views stay
+};
+
+struct RetiredSegment {
+  SegmentId id = kNoSegment;
+  RetirementCause cause = RetirementCause::kLeft;
+};
+
+struct RenamedSegment {
+  SegmentId from = kNoSegment;  ///< the newer; it exists no longer
+  SegmentId to = kNoSegment;    ///< the older
+};
+
+/// What one call changed. A segment appears in at most one of the four lists as itself (`renamed.from`, `retired`, `created`,
+/// `grown`); the target of a renaming is also in `grown` or `retired`.
+struct SegmentUpdate {
+  std::vector<SegmentId> created;
+  std::vector<SegmentId> grown;  ///< points came or moved
+  std::vector<RenamedSegment> renamed;
+  std::vector<RetiredSegment> retired;
+};
+
+/// Counts for the funnel: clusters by what became of them.
+struct ClusterCounts {
+  std::size_t clusters = 0;
+  std::size_t segments = 0;
+  std::size_t too_small = 0;
+  std::size_t too_large = 0;
+  std::size_t cut = 0;
+};
+
+/// Clusters the active voxels of a grid as they come and keeps track of segments.
+///
+/// Clusters are the connected components over all voxels ever clustered, under the relation "within the growing radius, and
+/// accepted by the policy, when the later of the two was clustered"; a cluster never splits. Union-find over labels persists
+/// between calls; labels and clusters are reference-counted and reclaimed. Remove is O(removed), Insert O(activated * neighbours +
+/// moved), both nearly. Not thread-safe. The grid must outlive the segmenter.
+template <class Policy>
+class IncrementalSegmenter {
+ public:
+  /// Throws std::invalid_argument naming the parameter that is out of range.
+  IncrementalSegmenter(const SegmenterParameters& parameters, const DynamicVoxelGrid& grid, Policy policy = {});
+
+  /// Takes removed voxels out. To be called before the grid is called again.
+  SegmentUpdate Remove(const std::vector<RemovedVoxel>& removed);
+
+  /// Clusters activated voxels and follows moved centroids.
+  SegmentUpdate Insert(const VoxelUpdate& update);
+
+  const SegmentMoments& Moments(SegmentId segment) const;
+  /// Voxels of the segment that are in the local map now. O(segment).
+  std::vector<VoxelHandle> Voxels(SegmentId segment) const;
+  /// The segment of a voxel, kNoSegment if its cluster is none. Amortised nearly O(1).
+  SegmentId SegmentOf(VoxelHandle voxel) const;
+  /// A name of the voxel's cluster that is the same for exactly the voxels of one cluster, until the next call.
+  std::uint32_t ClusterOf(VoxelHandle voxel) const;
+  /// All tracked segments, ascending.
+  std::vector<SegmentId> Segments() const;
+
+  const ClusterCounts& counts() const { return counts_; }
+  std::size_t memory_bytes() const;
+
+ private:
+  using Label = std::uint32_t;
+  using ClusterIndex = std::uint32_t;
+  static constexpr Label kNoLabel = 0xffffffffu;
+  static constexpr VoxelHandle kEnd = 0xffffffffu;
+
+  enum class State : std::uint8_t { kFree, kSmall, kSegment, kTooLarge, kCut };
+
+  struct Node {                ///< of the union-find forest over labels
+    Label parent;
+    std::uint32_t references;  ///< voxels that carry the label, and nodes that point to it
+    ClusterIndex cluster;      ///< valid at roots
+  };
+  struct Cluster {
+    State state = State::kFree;
+    bool dirty = false;
+    SegmentId id = kNoSegment;
+    std::uint32_t live_voxels = 0;         ///< in the local map now
+    VoxelHandle first = kEnd;              ///< of its circular doubly linked list of voxels
+    SegmentMoments moments;
+    std::vector<SegmentId> absorbed;       ///< IDs that merged into it in this call, its own not included
+  };
+  struct VoxelNode {
+    Label label = kNoLabel;
+    VoxelHandle previous = kEnd;
+    VoxelHandle next = kEnd;
+  };
+
+  Label FindRoot(Label label) const;
+  Cluster& ClusterAt(Label root) { return clusters_[nodes_[root].cluster]; }
+  const Cluster& ClusterAt(Label root) const { return clusters_[nodes_[root].cluster]; }
+  Label NewCluster();
+  void AddVoxel(Label root, VoxelHandle voxel);
+  Label Link(Label a, Label b);
+  void GrowFromSeed(VoxelHandle seed);
+  void Release(Label label) const;
+  void FreeCluster(ClusterIndex cluster);
+  void MarkDirty(Label root);
+  void Settle(SegmentUpdate* update);
+  void SetState(Cluster* cluster, State state);
+  std::size_t SizeOf(const Cluster& cluster) const;
+  const Cluster& TrackedCluster(SegmentId segment) const;
+
+  SegmenterParameters parameters_;
+  const DynamicVoxelGrid* grid_;
+  Policy policy_;
+  NeighbourStencil stencil_;
+  mutable std::vector<Node> nodes_;
+  mutable std::vector<Label> free_nodes_;
+  std::vector<Cluster> clusters_;
+  std::vector<ClusterIndex> free_clusters_;
+  std::vector<VoxelNode> voxels_;
+  std::vector<std::pair<ClusterIndex, Label>> dirty_;  ///< roots at the time of marking
+  std::vector<std::pair<SegmentId, ClusterIndex>> tracked_;  ///< sorted by ID
+  std::vector<VoxelHandle> seeds_;                     ///< work space
+  SegmentId next_id_ = 1;
+  ClusterCounts counts_;
+};
+
+extern template class IncrementalSegmenter<EuclideanPolicy>;
+
+}  // namespace incremental_segmatch

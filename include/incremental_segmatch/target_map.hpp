@@ -1,0 +1,99 @@
+/// \file
+/// Target map: segments by (robot, ID) with their views, and the trajectories that the views hang on (METHOD 4).
+#pragma once
+
+#include <cstdint>
+#include <map>
+#include <memory>
+#include <optional>
+#include <string>
+#include <unordered_map>
+#include <vector>
+
+#include "incremental_segmatch/segment_delta.hpp"
+#include "incremental_segmatch/types.hpp"
+
+namespace incremental_segmatch {
+
+/// A trajectory pose: where odometry had the sensor, and where it is in the map after corrections.
+struct TrajectoryPose {
+  StampNs stamp_ns = 0;
+  Pose T_odom_sensor = Pose::Identity();
+  Pose T_map_sensor = Pose::Identity();
+};
+
+/// One look at a segment.
+struct SegmentView {
+  RobotIndex robot = 0;             ///< on whose trajectory it hangs
+  std::uint32_t pose = 0;           ///< index of the trajectory pose that it was seen from
+  std::uint32_t size = 0;           ///< voxels
+  Eigen::Vector3d centroid_sensor = Eigen::Vector3d::Zero();  ///< in the frame of that pose
+  Descriptor descriptor;
+  std::shared_ptr<const Points> points_centroid;  ///< relative to the centroid, axes of that robot's odom; may be null
+};
+
+struct TargetSegment {
+  std::vector<SegmentView> views;   ///< oldest first; never empty
+  StampNs last_seen_ns = 0;
+  bool tracked = false;             ///< by its robot's local map, now
+};
+
+struct TargetMapParameters {
+  std::size_t max_views = 4;        ///< kept of a segment: the newest, and the largest of the others
+};
+
+/// Holds segments and trajectories; knows nothing of matching. Not thread-safe.
+class TargetMap {
+ public:
+  /// Throws std::invalid_argument naming the parameter that is out of range.
+  explicit TargetMap(const TargetMapParameters& parameters);
+
+  /// Index of a robot, given at the first call with its name.
+  RobotIndex RobotByName(const std::string& name);
+  const std::string& RobotName(RobotIndex robot) const { return robots_.at(robot).name; }
+  std::size_t robots() const { return robots_.size(); }
+
+  /// Appends a pose to a robot's trajectory (stamps increase) and returns its index. It follows the last correction rigidly.
+  std::uint32_t AddPose(RobotIndex robot, StampNs stamp_ns, const Pose& T_odom_sensor);
+  const std::vector<TrajectoryPose>& Trajectory(RobotIndex robot) const { return robots_.at(robot).trajectory; }
+  /// T_map_odom of a robot now.
+  const Pose& T_map_odom(RobotIndex robot) const { return robots_.at(robot).T_map_odom; }
+  /// A corrected trajectory: poses at corrected stamps are taken, those between and after follow the nearest earlier
+  /// corrected pose rigidly. O(trajectory).
+  void CorrectTrajectory(RobotIndex robot, const std::vector<StampedPose>& T_map_sensor);
+
+  /// Sets the newest state of a segment as its view: replaces the last view unless `keep_last`.
+  void UpdateSegment(const SegmentKey& key, SegmentView view, bool keep_last, StampNs stamp_ns);
+  /// Moves the views of `from` to `to`; `from` is gone. Views stay ordered by their pose's stamp.
+  void MoveViews(const SegmentKey& from, const SegmentKey& to);
+  void Erase(const SegmentKey& key) { segments_.erase(key); }
+  TargetSegment* Find(const SegmentKey& key);
+  const TargetSegment* Find(const SegmentKey& key) const;
+
+  /// Ordered by key.
+  const std::map<SegmentKey, TargetSegment>& segments() const { return segments_; }
+
+  /// Centroid of a view in the map, after all corrections.
+  Eigen::Vector3d CentroidMap(const SegmentView& view) const;
+  /// Pose in the map that a view was seen from.
+  const TrajectoryPose& PoseOf(const SegmentView& view) const { return robots_.at(view.robot).trajectory.at(view.pose); }
+
+  std::size_t memory_bytes() const;
+
+  /// Writes the map; a crash while writing leaves the previous file whole. Throws std::runtime_error naming the file.
+  void Save(const std::string& path) const;
+  /// Reads a map. Throws std::runtime_error naming the file and what is wrong with it.
+  static TargetMap Load(const std::string& path, const TargetMapParameters& parameters);
+
+ private:
+  struct Robot {
+    std::string name;
+    std::vector<TrajectoryPose> trajectory;
+    Pose T_map_odom = Pose::Identity();
+  };
+  TargetMapParameters parameters_;
+  std::vector<Robot> robots_;
+  std::map<SegmentKey, TargetSegment> segments_;
+};
+
+}  // namespace incremental_segmatch
