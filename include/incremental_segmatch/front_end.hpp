@@ -61,6 +61,8 @@ class FrontEnd {
  public:
   /// Throws std::invalid_argument naming the parameter that is out of range.
   FrontEnd(const FrontEndParameters& parameters, std::string robot);
+  FrontEnd(const FrontEnd&) = delete;  // the segmenter refers to the grid
+  FrontEnd& operator=(const FrontEnd&) = delete;
 
   /// Takes one scan. Throws std::invalid_argument if its stamp is not after the last one's or its pose is not finite: nothing
   /// has changed then.
@@ -87,9 +89,12 @@ class FrontEnd {
     Eigen::Vector3d view_position_odom = Eigen::Vector3d::Zero();
   };
 
+  VoxelUpdate RemoveDistantVoxels(const Pose& T_odom_sensor);
+  SegmentDelta DescribeChanges(const SegmentUpdate& left, const SegmentUpdate& grown);
   SegmentState DescribeSegment(SegmentId segment) const;
+  bool IsNewView(const SegmentState& state);
   std::shared_ptr<const Points> SegmentPoints(SegmentId segment, const Eigen::Vector3d& centroid_odom) const;
-  SegmentDelta DescribeChanges(const SegmentUpdate& left, const SegmentUpdate& grown, const Scan& scan);
+  SegmentDelta EmptyDelta() const;
 
   FrontEndParameters parameters_;
   std::string robot_;

@@ -96,24 +96,28 @@ class IncrementalSegmenter {
  private:
   using Label = std::uint32_t;
   using ClusterIndex = std::uint32_t;
-  static constexpr Label kNoLabel = 0xffffffffu;
+  static constexpr Label kNoLabel = 0xffffffffu;   // not clustered yet
+  static constexpr Label kQueued = 0xfffffffeu;    // in the region that grows now
   static constexpr VoxelHandle kEnd = 0xffffffffu;
 
   enum class State : std::uint8_t { kFree, kSmall, kSegment, kTooLarge, kCut };
 
-  struct Node {                ///< of the union-find forest over labels
-    Label parent;
-    std::uint32_t references;  ///< voxels that carry the label, and nodes that point to it
-    ClusterIndex cluster;      ///< valid at roots
+  // A label: node of the union-find forest.
+  struct Node {
+    Label parent = kNoLabel;       // itself at roots
+    std::uint32_t references = 0;  // voxels that carry the label, and nodes that point to it
+    ClusterIndex cluster = 0;      // at roots
   };
   struct Cluster {
     State state = State::kFree;
     bool dirty = false;
+    bool grew = false;
     SegmentId id = kNoSegment;
-    std::uint32_t live_voxels = 0;         ///< in the local map now
-    VoxelHandle first = kEnd;              ///< of its circular doubly linked list of voxels
+    Label root = kNoLabel;
+    std::uint32_t live_voxels = 0;    // in the local map now
+    VoxelHandle first = kEnd;         // of its circular, doubly linked list of voxels
     SegmentMoments moments;
-    std::vector<SegmentId> absorbed;       ///< IDs that merged into it in this call, its own not included
+    std::vector<SegmentId> absorbed;  // IDs of segments that merged into it in this call
   };
   struct VoxelNode {
     Label label = kNoLabel;
@@ -121,33 +125,40 @@ class IncrementalSegmenter {
     VoxelHandle next = kEnd;
   };
 
+  bool IsClustered(VoxelHandle voxel) const {
+    return voxel < voxels_.size() && voxels_[voxel].label != kNoLabel && voxels_[voxel].label != kQueued;
+  }
+  Eigen::Vector3d PointOf(VoxelHandle voxel, const Eigen::Vector3f& in_block) const {
+    return grid_->BlockCorner(voxel) + in_block.cast<double>();
+  }
   Label FindRoot(Label label) const;
+  void Release(Label label) const;
   Cluster& ClusterAt(Label root) { return clusters_[nodes_[root].cluster]; }
-  const Cluster& ClusterAt(Label root) const { return clusters_[nodes_[root].cluster]; }
   Label NewCluster();
+  void GrowFromSeed(VoxelHandle seed);
   void AddVoxel(Label root, VoxelHandle voxel);
   Label Link(Label a, Label b);
-  void GrowFromSeed(VoxelHandle seed);
-  void Release(Label label) const;
-  void FreeCluster(ClusterIndex cluster);
-  void MarkDirty(Label root);
-  void Settle(SegmentUpdate* update);
+  void MarkDirty(Cluster* cluster);
+  SegmentUpdate Settle();
+  void SettleCluster(ClusterIndex index, SegmentUpdate* update);
   void SetState(Cluster* cluster, State state);
-  std::size_t SizeOf(const Cluster& cluster) const;
+  std::size_t& CountOf(State state);
+  void Track(SegmentId segment, ClusterIndex cluster);
+  void Untrack(SegmentId segment);
   const Cluster& TrackedCluster(SegmentId segment) const;
 
   SegmenterParameters parameters_;
   const DynamicVoxelGrid* grid_;
   Policy policy_;
   NeighbourStencil stencil_;
-  mutable std::vector<Node> nodes_;
+  mutable std::vector<Node> nodes_;          // mutable: finding a root shortens its path
   mutable std::vector<Label> free_nodes_;
   std::vector<Cluster> clusters_;
   std::vector<ClusterIndex> free_clusters_;
   std::vector<VoxelNode> voxels_;
-  std::vector<std::pair<ClusterIndex, Label>> dirty_;  ///< roots at the time of marking
-  std::vector<std::pair<SegmentId, ClusterIndex>> tracked_;  ///< sorted by ID
-  std::vector<VoxelHandle> seeds_;                     ///< work space
+  std::vector<ClusterIndex> dirty_;
+  std::vector<std::pair<SegmentId, ClusterIndex>> tracked_;  // ascending IDs
+  std::vector<VoxelHandle> seeds_, queue_, region_;          // work space
   SegmentId next_id_ = 1;
   ClusterCounts counts_;
 };

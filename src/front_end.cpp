@@ -1,0 +1,158 @@
+#include "incremental_segmatch/front_end.hpp"
+
+#include <algorithm>
+#include <stdexcept>
+#include <utility>
+
+namespace incremental_segmatch {
+
+FrontEnd::FrontEnd(const FrontEndParameters& parameters, std::string robot)
+    : parameters_(parameters),
+      robot_(std::move(robot)),
+      ground_filter_(parameters.ground),
+      grid_(parameters.grid),
+      segmenter_(parameters.segmenter, grid_),
+      describer_(parameters.descriptor, parameters.grid.resolution_m) {
+  if (!(parameters.local_radius_m > 0.0)) throw std::invalid_argument("front_end.local_radius_m: must be positive");
+  if (!(parameters.view.growth_factor > 1.0)) throw std::invalid_argument("front_end.view.growth_factor: must exceed 1");
+  if (!(parameters.view.baseline_m > 0.0)) throw std::invalid_argument("front_end.view.baseline_m: must be positive");
+}
+
+FrontEndStep FrontEnd::Process(const Scan& scan) {
+  if (started_ && scan.stamp_ns <= last_stamp_ns_)
+    throw std::invalid_argument("scan at " + std::to_string(scan.stamp_ns) + " ns is not after the last one at " +
+                                std::to_string(last_stamp_ns_) + " ns; start a new front end when time goes back");
+  if (!scan.T_odom_sensor.matrix().allFinite())
+    throw std::invalid_argument("the sensor pose of the scan at " + std::to_string(scan.stamp_ns) + " ns is not finite");
+  started_ = true;
+  last_stamp_ns_ = scan.stamp_ns;
+  last_T_odom_sensor_ = scan.T_odom_sensor;
+  ++sequence_;
+
+  FrontEndStep step;
+  StageTimer timer;
+
+  const GroundFilterResult filtered = ground_filter_.Filter(scan.points_sensor, scan.T_odom_sensor);
+  timer.Lap("ground_filter");
+
+  const VoxelUpdate left = grid_.RemoveOutside(scan.T_odom_sensor.translation(), parameters_.local_radius_m);
+  timer.Lap("voxel_removal");
+  const SegmentUpdate left_segments = segmenter_.Remove(left.removed);
+  timer.Lap("segment_removal");
+
+  const VoxelUpdate inserted = grid_.Insert(filtered.obstacles_sensor, scan.T_odom_sensor);
+  timer.Lap("voxel_insertion");
+  const SegmentUpdate grown_segments = segmenter_.Insert(inserted);
+  timer.Lap("segmentation");
+
+  step.delta = DescribeChanges(left_segments, grown_segments);
+  timer.Lap("description");
+
+  step.times = timer.Take();
+  step.counts.points = scan.points_sensor.size();
+  step.counts.obstacle_points = filtered.obstacles_sensor.size();
+  step.counts.dropped_nonfinite = filtered.dropped_nonfinite + inserted.dropped_nonfinite;
+  step.counts.dropped_outside = inserted.dropped_outside;
+  step.counts.voxels = grid_.active_voxels();
+  step.counts.activated_voxels = inserted.activated.size();
+  step.counts.moved_voxels = inserted.moved.size();
+  step.counts.removed_voxels = left.removed.size();
+  step.counts.clusters = segmenter_.counts();
+  return step;
+}
+
+void FrontEnd::ApplyJump(const Pose& T_new_old) {
+  grid_.Transform(T_new_old);
+  last_T_odom_sensor_ = T_new_old * last_T_odom_sensor_;
+  for (auto& [segment, tracked] : tracked_) tracked.view_position_odom = T_new_old * tracked.view_position_odom;
+  jumped_ = true;
+}
+
+/// What both updates of a step did to segments, in the terms of the table in METHOD 3.
+SegmentDelta FrontEnd::DescribeChanges(const SegmentUpdate& left, const SegmentUpdate& grown) {
+  SegmentDelta delta = EmptyDelta();
+  delta.retired = left.retired;
+  delta.retired.insert(delta.retired.end(), grown.retired.begin(), grown.retired.end());
+  delta.renamed = grown.renamed;
+  for (const RetiredSegment& retired : delta.retired) tracked_.erase(retired.id);
+  for (const RenamedSegment& renamed : delta.renamed) tracked_.erase(renamed.from);
+
+  std::vector<SegmentId> changed;
+  if (jumped_) {
+    changed = segmenter_.Segments();
+    jumped_ = false;
+  } else {
+    changed = grown.grown;
+    changed.insert(changed.end(), grown.created.begin(), grown.created.end());
+    std::sort(changed.begin(), changed.end());
+  }
+  delta.changed.reserve(changed.size());
+  for (const SegmentId segment : changed) {
+    SegmentState state = DescribeSegment(segment);
+    state.new_view = IsNewView(state);
+    if (state.new_view) state.points_centroid = SegmentPoints(segment, state.centroid_odom);
+    delta.changed.push_back(std::move(state));
+  }
+  return delta;
+}
+
+SegmentState FrontEnd::DescribeSegment(SegmentId segment) const {
+  const SegmentMoments& moments = segmenter_.Moments(segment);
+  SegmentState state;
+  state.id = segment;
+  state.size = static_cast<std::uint32_t>(moments.count());
+  state.centroid_odom = grid_.T_odom_grid() * moments.Centroid();
+  state.descriptor = describer_.Describe(moments, grid_.T_odom_grid().linear().transpose() * Eigen::Vector3d::UnitZ());
+  return state;
+}
+
+bool FrontEnd::IsNewView(const SegmentState& state) {
+  const Eigen::Vector3d position = last_T_odom_sensor_.translation();
+  const auto [it, added] = tracked_.try_emplace(state.id);
+  Tracked& tracked = it->second;
+  const bool is_new = added || state.size >= parameters_.view.growth_factor * tracked.view_size ||
+                      (position - tracked.view_position_odom).norm() >= parameters_.view.baseline_m;
+  if (is_new) tracked = {state.size, position};
+  return is_new;
+}
+
+std::shared_ptr<const Points> FrontEnd::SegmentPoints(SegmentId segment, const Eigen::Vector3d& centroid_odom) const {
+  const std::vector<VoxelHandle> voxels = segmenter_.Voxels(segment);
+  auto points = std::make_shared<Points>();
+  points->reserve(voxels.size());
+  for (const VoxelHandle voxel : voxels) points->push_back((grid_.CentroidOdom(voxel) - centroid_odom).cast<float>());
+  return points;
+}
+
+SegmentDelta FrontEnd::EmptyDelta() const {
+  SegmentDelta delta;
+  delta.robot = robot_;
+  delta.sequence = sequence_;
+  delta.stamp_ns = last_stamp_ns_;
+  delta.T_odom_sensor = last_T_odom_sensor_;
+  return delta;
+}
+
+SegmentDelta FrontEnd::FullState() const {
+  SegmentDelta delta = EmptyDelta();
+  delta.full_state = true;
+  for (const SegmentId segment : segmenter_.Segments()) {
+    SegmentState state = DescribeSegment(segment);
+    state.new_view = true;
+    state.points_centroid = SegmentPoints(segment, state.centroid_odom);
+    delta.changed.push_back(std::move(state));
+  }
+  return delta;
+}
+
+std::vector<LocalPoint> FrontEnd::LocalCloud() const {
+  std::vector<LocalPoint> cloud;
+  cloud.reserve(grid_.active_voxels());
+  for (const VoxelHandle voxel : grid_.ActiveVoxels())
+    cloud.push_back({grid_.CentroidOdom(voxel).cast<float>(), segmenter_.SegmentOf(voxel)});
+  return cloud;
+}
+
+std::size_t FrontEnd::memory_bytes() const { return grid_.memory_bytes() + segmenter_.memory_bytes(); }
+
+}  // namespace incremental_segmatch

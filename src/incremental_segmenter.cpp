@@ -1,0 +1,358 @@
+#include "incremental_segmatch/incremental_segmenter.hpp"
+
+#include <algorithm>
+#include <stdexcept>
+#include <string>
+
+namespace incremental_segmatch {
+
+template <class Policy>
+IncrementalSegmenter<Policy>::IncrementalSegmenter(const SegmenterParameters& parameters, const DynamicVoxelGrid& grid,
+                                                   Policy policy)
+    : parameters_(parameters),
+      grid_(&grid),
+      policy_(std::move(policy)),
+      stencil_(parameters.growing_radius_m, grid.parameters().resolution_m) {
+  if (parameters.min_cluster_size < 1) throw std::invalid_argument("segmenter.min_cluster_size: must be at least 1");
+  if (parameters.max_cluster_size < parameters.min_cluster_size)
+    throw std::invalid_argument("segmenter.max_cluster_size: must be at least min_cluster_size (" +
+                                std::to_string(parameters.min_cluster_size) + "), is " +
+                                std::to_string(parameters.max_cluster_size));
+}
+
+template <class Policy>
+SegmentUpdate IncrementalSegmenter<Policy>::Remove(const std::vector<RemovedVoxel>& removed) {
+  for (const RemovedVoxel& gone : removed) {
+    if (!IsClustered(gone.voxel)) continue;
+    VoxelNode& node = voxels_[gone.voxel];
+    Cluster& cluster = ClusterAt(FindRoot(node.label));
+    --cluster.live_voxels;
+    if (cluster.live_voxels == 0) {
+      cluster.first = kEnd;
+    } else {
+      voxels_[node.previous].next = node.next;
+      voxels_[node.next].previous = node.previous;
+      if (cluster.first == gone.voxel) cluster.first = node.next;
+    }
+    if (parameters_.boundary == BoundaryPolicy::kInvalidate) {
+      cluster.moments.Subtract(PointOf(gone.voxel, gone.centroid_block));
+      if (cluster.state != State::kTooLarge) SetState(&cluster, State::kCut);
+      MarkDirty(&cluster);
+    } else if (cluster.live_voxels == 0) {
+      MarkDirty(&cluster);
+    }
+    Release(node.label);
+    node = VoxelNode();
+  }
+  return Settle();
+}
+
+template <class Policy>
+SegmentUpdate IncrementalSegmenter<Policy>::Insert(const VoxelUpdate& update) {
+  if (voxels_.size() < grid_->handle_capacity()) voxels_.resize(grid_->handle_capacity());
+  for (const MovedVoxel& moved : update.moved) {
+    if (!IsClustered(moved.voxel)) continue;
+    Cluster& cluster = ClusterAt(FindRoot(voxels_[moved.voxel].label));
+    const Eigen::Vector3d corner = grid_->BlockCorner(moved.voxel);
+    cluster.moments.Move(corner + moved.before_block.cast<double>(), corner + moved.after_block.cast<double>());
+    cluster.grew = true;
+    MarkDirty(&cluster);
+  }
+  seeds_ = update.activated;
+  policy_.PrepareSeeds(&seeds_);
+  for (const VoxelHandle seed : seeds_)
+    if (!IsClustered(seed)) GrowFromSeed(seed);
+  return Settle();
+}
+
+/// Algorithm 1: the region of new voxels that is reached from the seed joins, and links, the clusters that it meets.
+template <class Policy>
+void IncrementalSegmenter<Policy>::GrowFromSeed(VoxelHandle seed) {
+  Label root = kNoLabel;
+  region_.clear();
+  queue_.assign(1, seed);
+  voxels_[seed].label = kQueued;
+  while (!queue_.empty()) {
+    const VoxelHandle from = queue_.back();
+    queue_.pop_back();
+    region_.push_back(from);
+    grid_->ForEachNeighbour(stencil_, from, [&](VoxelHandle to, const Eigen::Vector3f&) {
+      const Label label = voxels_[to].label;
+      if (label == kQueued || !policy_.CanPointBeSeed(to) || !policy_.CanGrowToPoint(from, to)) return true;
+      if (label == kNoLabel) {
+        voxels_[to].label = kQueued;
+        queue_.push_back(to);
+      } else if (label != root) {
+        const Label met = FindRoot(label);
+        root = root == kNoLabel ? met : Link(root, met);
+      }
+      return true;
+    });
+  }
+  if (root == kNoLabel) root = NewCluster();
+  for (const VoxelHandle voxel : region_) AddVoxel(root, voxel);
+}
+
+template <class Policy>
+typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::FindRoot(Label label) const {
+  while (nodes_[label].parent != label) {
+    const Label parent = nodes_[label].parent;
+    const Label grandparent = nodes_[parent].parent;
+    if (grandparent == parent) return parent;
+    nodes_[label].parent = grandparent;  // path halving
+    ++nodes_[grandparent].references;
+    Release(parent);
+    label = grandparent;
+  }
+  return label;
+}
+
+template <class Policy>
+void IncrementalSegmenter<Policy>::Release(Label label) const {
+  while (--nodes_[label].references == 0 && nodes_[label].parent != label) {
+    free_nodes_.push_back(label);
+    label = nodes_[label].parent;
+  }
+}
+
+template <class Policy>
+typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::NewCluster() {
+  Label label;
+  if (free_nodes_.empty()) {
+    label = static_cast<Label>(nodes_.size());
+    nodes_.emplace_back();
+  } else {
+    label = free_nodes_.back();
+    free_nodes_.pop_back();
+  }
+  ClusterIndex index;
+  if (free_clusters_.empty()) {
+    index = static_cast<ClusterIndex>(clusters_.size());
+    clusters_.emplace_back();
+  } else {
+    index = free_clusters_.back();
+    free_clusters_.pop_back();
+  }
+  nodes_[label] = Node{label, 0, index};
+  Cluster& cluster = clusters_[index];
+  cluster.root = label;
+  SetState(&cluster, State::kSmall);
+  return label;
+}
+
+template <class Policy>
+void IncrementalSegmenter<Policy>::AddVoxel(Label root, VoxelHandle voxel) {
+  Cluster& cluster = ClusterAt(root);
+  VoxelNode& node = voxels_[voxel];
+  node.label = root;
+  ++nodes_[root].references;
+  if (cluster.first == kEnd) {
+    node.previous = node.next = voxel;
+  } else {
+    node.next = cluster.first;
+    node.previous = voxels_[cluster.first].previous;
+    voxels_[node.previous].next = voxel;
+    voxels_[node.next].previous = voxel;
+  }
+  cluster.first = voxel;
+  ++cluster.live_voxels;
+  cluster.moments.Add(PointOf(voxel, grid_->CentroidInBlock(voxel)));
+  cluster.grew = true;
+  MarkDirty(&cluster);
+}
+
+/// LinkPartialClusters: both roots' sets become one. What that means for segment IDs is settled at the end of the call, so that
+/// it does not depend on the order in which clusters meet.
+template <class Policy>
+typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::Link(Label a, Label b) {
+  if (a == b) return a;
+  if (ClusterAt(a).live_voxels < ClusterAt(b).live_voxels) std::swap(a, b);
+  const ClusterIndex absorbed_index = nodes_[b].cluster;
+  Cluster& kept = ClusterAt(a);
+  Cluster& absorbed = clusters_[absorbed_index];
+  nodes_[b].parent = a;
+  ++nodes_[a].references;
+
+  kept.moments.Merge(absorbed.moments);
+  kept.live_voxels += absorbed.live_voxels;
+  if (kept.first == kEnd) {
+    kept.first = absorbed.first;
+  } else if (absorbed.first != kEnd) {
+    const VoxelHandle kept_last = voxels_[kept.first].previous, absorbed_last = voxels_[absorbed.first].previous;
+    voxels_[kept_last].next = absorbed.first;
+    voxels_[absorbed.first].previous = kept_last;
+    voxels_[absorbed_last].next = kept.first;
+    voxels_[kept.first].previous = absorbed_last;
+  }
+  if (absorbed.id != kNoSegment) kept.absorbed.push_back(absorbed.id);
+  kept.absorbed.insert(kept.absorbed.end(), absorbed.absorbed.begin(), absorbed.absorbed.end());
+  if (absorbed.state == State::kTooLarge || (absorbed.state == State::kCut && kept.state != State::kTooLarge))
+    SetState(&kept, absorbed.state);
+  kept.grew = true;
+  MarkDirty(&kept);
+
+  SetState(&absorbed, State::kFree);
+  absorbed = Cluster();
+  free_clusters_.push_back(absorbed_index);
+  return a;
+}
+
+template <class Policy>
+void IncrementalSegmenter<Policy>::MarkDirty(Cluster* cluster) {
+  if (cluster->dirty) return;
+  cluster->dirty = true;
+  dirty_.push_back(static_cast<ClusterIndex>(cluster - clusters_.data()));
+}
+
+/// Ends a call: every set of linked clusters is one cluster now, with one segment ID or none.
+template <class Policy>
+SegmentUpdate IncrementalSegmenter<Policy>::Settle() {
+  SegmentUpdate update;
+  for (const ClusterIndex index : dirty_)
+    if (clusters_[index].dirty) SettleCluster(index, &update);
+  dirty_.clear();
+  return update;
+}
+
+template <class Policy>
+void IncrementalSegmenter<Policy>::SettleCluster(ClusterIndex index, SegmentUpdate* update) {
+  Cluster& cluster = clusters_[index];
+  cluster.dirty = false;
+  const bool grew = std::exchange(cluster.grew, false);
+  std::vector<SegmentId> ids = std::exchange(cluster.absorbed, {});
+  if (cluster.id != kNoSegment) ids.push_back(cluster.id);
+  const auto retire = [&](RetirementCause cause) {
+    for (const SegmentId id : ids) {
+      update->retired.push_back({id, cause});
+      Untrack(id);
+    }
+    cluster.id = kNoSegment;
+  };
+
+  if (cluster.live_voxels == 0) {
+    retire(RetirementCause::kLeft);
+    free_nodes_.push_back(cluster.root);
+    SetState(&cluster, State::kFree);
+    cluster = Cluster();
+    free_clusters_.push_back(index);
+    return;
+  }
+  const std::size_t size = cluster.moments.count();
+  if (size > parameters_.max_cluster_size) SetState(&cluster, State::kTooLarge);
+  if (cluster.state == State::kTooLarge) {
+    retire(RetirementCause::kTooLarge);
+  } else if (cluster.state == State::kCut) {
+    retire(RetirementCause::kCut);
+  } else if (!ids.empty()) {
+    SetState(&cluster, State::kSegment);
+    cluster.id = *std::min_element(ids.begin(), ids.end());
+    for (const SegmentId id : ids) {
+      if (id == cluster.id) continue;
+      update->renamed.push_back({id, cluster.id});
+      Untrack(id);
+    }
+    Track(cluster.id, index);
+    if (grew) update->grown.push_back(cluster.id);
+  } else if (size >= parameters_.min_cluster_size) {
+    SetState(&cluster, State::kSegment);
+    cluster.id = next_id_++;
+    Track(cluster.id, index);
+    update->created.push_back(cluster.id);
+  }
+}
+
+template <class Policy>
+std::size_t& IncrementalSegmenter<Policy>::CountOf(State state) {
+  switch (state) {
+    case State::kSmall: return counts_.too_small;
+    case State::kSegment: return counts_.segments;
+    case State::kTooLarge: return counts_.too_large;
+    default: return counts_.cut;
+  }
+}
+
+template <class Policy>
+void IncrementalSegmenter<Policy>::SetState(Cluster* cluster, State state) {
+  if (cluster->state == State::kFree) {
+    ++counts_.clusters;
+  } else {
+    --CountOf(cluster->state);
+  }
+  if (state == State::kFree) {
+    --counts_.clusters;
+  } else {
+    ++CountOf(state);
+  }
+  cluster->state = state;
+}
+
+template <class Policy>
+void IncrementalSegmenter<Policy>::Track(SegmentId segment, ClusterIndex cluster) {
+  const auto at = std::lower_bound(tracked_.begin(), tracked_.end(), std::make_pair(segment, ClusterIndex{0}));
+  if (at != tracked_.end() && at->first == segment) {
+    at->second = cluster;
+  } else {
+    tracked_.insert(at, {segment, cluster});
+  }
+}
+
+template <class Policy>
+void IncrementalSegmenter<Policy>::Untrack(SegmentId segment) {
+  tracked_.erase(std::lower_bound(tracked_.begin(), tracked_.end(), std::make_pair(segment, ClusterIndex{0})));
+}
+
+template <class Policy>
+const typename IncrementalSegmenter<Policy>::Cluster& IncrementalSegmenter<Policy>::TrackedCluster(SegmentId segment) const {
+  const auto at = std::lower_bound(tracked_.begin(), tracked_.end(), std::make_pair(segment, ClusterIndex{0}));
+  if (at == tracked_.end() || at->first != segment)
+    throw std::invalid_argument("segment " + std::to_string(segment) + " is not tracked");
+  return clusters_[at->second];
+}
+
+template <class Policy>
+const SegmentMoments& IncrementalSegmenter<Policy>::Moments(SegmentId segment) const {
+  return TrackedCluster(segment).moments;
+}
+
+template <class Policy>
+std::vector<VoxelHandle> IncrementalSegmenter<Policy>::Voxels(SegmentId segment) const {
+  const Cluster& cluster = TrackedCluster(segment);
+  std::vector<VoxelHandle> voxels;
+  voxels.reserve(cluster.live_voxels);
+  VoxelHandle voxel = cluster.first;
+  do {
+    voxels.push_back(voxel);
+    voxel = voxels_[voxel].next;
+  } while (voxel != cluster.first);
+  return voxels;
+}
+
+template <class Policy>
+SegmentId IncrementalSegmenter<Policy>::SegmentOf(VoxelHandle voxel) const {
+  return IsClustered(voxel) ? clusters_[ClusterOf(voxel)].id : kNoSegment;
+}
+
+template <class Policy>
+std::uint32_t IncrementalSegmenter<Policy>::ClusterOf(VoxelHandle voxel) const {
+  if (!IsClustered(voxel)) throw std::invalid_argument("voxel " + std::to_string(voxel) + " is in no cluster");
+  return nodes_[FindRoot(voxels_[voxel].label)].cluster;
+}
+
+template <class Policy>
+std::vector<SegmentId> IncrementalSegmenter<Policy>::Segments() const {
+  std::vector<SegmentId> segments;
+  segments.reserve(tracked_.size());
+  for (const auto& entry : tracked_) segments.push_back(entry.first);
+  return segments;
+}
+
+template <class Policy>
+std::size_t IncrementalSegmenter<Policy>::memory_bytes() const {
+  return nodes_.capacity() * sizeof(Node) + free_nodes_.capacity() * sizeof(Label) + clusters_.capacity() * sizeof(Cluster) +
+         free_clusters_.capacity() * sizeof(ClusterIndex) + voxels_.capacity() * sizeof(VoxelNode) +
+         (seeds_.capacity() + queue_.capacity() + region_.capacity()) * sizeof(VoxelHandle);
+}
+
+template class IncrementalSegmenter<EuclideanPolicy>;
+
+}  // namespace incremental_segmatch
