@@ -42,7 +42,8 @@ struct TargetMapParameters {
   std::size_t max_views = 4;        ///< kept of a segment: the newest, and the largest of the others
 };
 
-/// Holds segments and trajectories; knows nothing of matching. Not thread-safe.
+/// Holds segments and trajectories; knows nothing of matching. Not thread-safe. A robot index that RobotByName never gave throws
+/// std::out_of_range.
 class TargetMap {
  public:
   /// Throws std::invalid_argument naming the parameter that is out of range.
@@ -53,18 +54,24 @@ class TargetMap {
   const std::string& RobotName(RobotIndex robot) const { return robots_.at(robot).name; }
   std::size_t robots() const { return robots_.size(); }
 
-  /// Appends a pose to a robot's trajectory (stamps increase) and returns its index. It follows the last correction rigidly.
+  /// Appends a pose to a robot's trajectory and returns its index. It follows the last correction rigidly. Throws
+  /// std::invalid_argument if the stamp is not after the last one's or the pose is not finite.
   std::uint32_t AddPose(RobotIndex robot, StampNs stamp_ns, const Pose& T_odom_sensor);
   const std::vector<TrajectoryPose>& Trajectory(RobotIndex robot) const { return robots_.at(robot).trajectory; }
   /// T_map_odom of a robot now.
   const Pose& T_map_odom(RobotIndex robot) const { return robots_.at(robot).T_map_odom; }
-  /// A corrected trajectory: poses at corrected stamps are taken, those between and after follow the nearest earlier
-  /// corrected pose rigidly. O(trajectory).
+  /// A corrected trajectory, in any order: poses at corrected stamps are taken as they are; the others follow the nearest earlier
+  /// corrected pose rigidly, those before the first the first. A corrected pose between two stamps of the trajectory counts
+  /// from where odometry, interpolated, had the sensor then; one before or after the trajectory is ignored. T_map_odom is then
+  /// that of the newest corrected pose. Throws std::invalid_argument if a pose is not finite: nothing has changed then.
+  /// O((trajectory + corrections) log).
   void CorrectTrajectory(RobotIndex robot, const std::vector<StampedPose>& T_map_sensor);
 
-  /// Sets the newest state of a segment as its view: replaces the last view unless `keep_last`.
+  /// Sets the newest state of a segment, which is tracked from now on: `view` replaces the last view of its robot unless
+  /// `keep_last`. Throws std::invalid_argument if the view's pose does not exist.
   void UpdateSegment(const SegmentKey& key, SegmentView view, bool keep_last, StampNs stamp_ns);
-  /// Moves the views of `from` to `to`; `from` is gone. Views stay ordered by their pose's stamp.
+  /// Moves the views of `from` to `to`, which is made if there is none; `from` is gone. Views stay ordered by their pose's stamp;
+  /// `to` is tracked if either was, and last seen when the later of both was. Nothing happens if there is no `from`.
   void MoveViews(const SegmentKey& from, const SegmentKey& to);
   void Erase(const SegmentKey& key) { segments_.erase(key); }
   TargetSegment* Find(const SegmentKey& key);
@@ -82,7 +89,8 @@ class TargetMap {
 
   /// Writes the map; a crash while writing leaves the previous file whole. Throws std::runtime_error naming the file.
   void Save(const std::string& path) const;
-  /// Reads a map. Throws std::runtime_error naming the file and what is wrong with it.
+  /// Reads a map; no segment of it is tracked. Of a segment with more views than `parameters` allow the same ones stay as ever.
+  /// Throws std::runtime_error naming the file and what is wrong with it: damaged, truncated, of another kind or of a newer version.
   static TargetMap Load(const std::string& path, const TargetMapParameters& parameters);
 
  private:
@@ -91,6 +99,9 @@ class TargetMap {
     std::vector<TrajectoryPose> trajectory;
     Pose T_map_odom = Pose::Identity();
   };
+  /// Orders views by their pose's stamp and keeps max_views of them.
+  void TidyViews(std::vector<SegmentView>* views) const;
+
   TargetMapParameters parameters_;
   std::vector<Robot> robots_;
   std::map<SegmentKey, TargetSegment> segments_;
