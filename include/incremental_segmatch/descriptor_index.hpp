@@ -22,18 +22,20 @@ struct DescriptorMatch {
 /// O(log^2 n) amortised; a query that of O(log n) trees. Not thread-safe.
 class DescriptorIndex {
  public:
+  /// Throws std::invalid_argument if there are no dimensions.
   explicit DescriptorIndex(std::size_t dimensions);
   ~DescriptorIndex();
   DescriptorIndex(DescriptorIndex&&) noexcept;
   DescriptorIndex& operator=(DescriptorIndex&&) noexcept;
 
-  /// Throws std::invalid_argument on a wrong dimension or an item that is there already.
+  /// Throws std::invalid_argument on a wrong dimension, a value that is not finite, or an item that is there already.
   void Insert(std::uint64_t item, const Descriptor& descriptor);
   /// False if there is no such item.
   bool Remove(std::uint64_t item);
   std::size_t size() const;
 
-  /// The `count` nearest items among those within `radius` (infinity: no limit), by ascending (distance, item).
+  /// The `count` nearest items among those within `radius` (infinity: no limit), by ascending (distance, item), whatever the order
+  /// of insertions and removals. Throws std::invalid_argument on a wrong dimension or a value that is not finite.
   std::vector<DescriptorMatch> Nearest(const Descriptor& query, std::size_t count, float radius) const;
 
  private:
