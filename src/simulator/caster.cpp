@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <functional>
 #include <limits>
 
 namespace incremental_segmatch::simulator {
@@ -30,7 +31,8 @@ Caster::Caster(const SensorModel& sensor) : sensor_(sensor) {
 }
 
 Vector3f Caster::Direction(std::size_t ring, std::size_t column) const {
-  return {cos_elevation_[ring] * cos_azimuth_[column], cos_elevation_[ring] * sin_azimuth_[column], sin_elevation_[ring]};
+  return {cos_elevation_[ring] * cos_azimuth_[column], cos_elevation_[ring] * sin_azimuth_[column],
+          sin_elevation_[ring]};
 }
 
 Caster::Window Caster::WindowOf(const Vector3f& centre, const Matrix3f& R_sensor_prim, const Vector3f& half) const {
@@ -38,7 +40,8 @@ Caster::Window Caster::WindowOf(const Vector3f& centre, const Matrix3f& R_sensor
   // best of a few separating directions.
   Vector3f corners[8];
   for (int i = 0; i < 8; ++i) {
-    corners[i] = centre + R_sensor_prim * Vector3f(i & 1 ? half.x() : -half.x(), i & 2 ? half.y() : -half.y(), i & 4 ? half.z() : -half.z());
+    corners[i] = centre + R_sensor_prim * Vector3f(i & 1 ? half.x() : -half.x(), i & 2 ? half.y() : -half.y(),
+                                                   i & 4 ? half.z() : -half.z());
   }
   float low = corners[0].z(), high = low, rho_max = 0.f;
   for (const Vector3f& corner : corners) {
@@ -72,7 +75,8 @@ Caster::Window Caster::WindowOf(const Vector3f& centre, const Matrix3f& R_sensor
   const Vector2f ahead = centre.head<2>();
   float left = 0.f, right = 0.f;
   for (const Vector3f& corner : corners) {
-    const float angle = std::atan2(ahead.x() * corner.y() - ahead.y() * corner.x(), ahead.x() * corner.x() + ahead.y() * corner.y());
+    const float angle =
+        std::atan2(ahead.x() * corner.y() - ahead.y() * corner.x(), ahead.x() * corner.x() + ahead.y() * corner.y());
     left = std::max(left, angle);
     right = std::min(right, angle);
   }
@@ -109,13 +113,17 @@ void Caster::Collect(const Eigen::Isometry3d& T_world_sensor, const std::vector<
 void Caster::Draw(const Candidate& candidate) {
   const Matrix3f& R = candidate.R_prim_sensor;
   const Window& window = candidate.window;
-  for (int i = 0, column = window.column_begin; i < window.columns; ++i, column = column + 1 == sensor_.columns ? 0 : column + 1) {
-    const Vector3f level = cos_azimuth_[static_cast<std::size_t>(column)] * R.col(0) + sin_azimuth_[static_cast<std::size_t>(column)] * R.col(1);
+  for (int i = 0, column = window.column_begin; i < window.columns;
+       ++i, column = column + 1 == sensor_.columns ? 0 : column + 1) {
+    const Vector3f level = cos_azimuth_[static_cast<std::size_t>(column)] * R.col(0) +
+                           sin_azimuth_[static_cast<std::size_t>(column)] * R.col(1);
     for (int ring = window.ring_begin; ring < window.ring_end; ++ring) {
-      const std::size_t index = static_cast<std::size_t>(ring) * static_cast<std::size_t>(sensor_.columns) + static_cast<std::size_t>(column);
+      const std::size_t index =
+          static_cast<std::size_t>(ring) * static_cast<std::size_t>(sensor_.columns) + static_cast<std::size_t>(column);
       const float limit = sweep_.range_m[index];
       if (limit <= window.near_m) continue;
-      const Vector3f direction = cos_elevation_[static_cast<std::size_t>(ring)] * level + sin_elevation_[static_cast<std::size_t>(ring)] * R.col(2);
+      const Vector3f direction = cos_elevation_[static_cast<std::size_t>(ring)] * level +
+                                 sin_elevation_[static_cast<std::size_t>(ring)] * R.col(2);
       const RayHit hit = Intersect(*candidate.primitive, candidate.origin_prim_m, direction, limit);
       if (!(hit.range_m < limit)) continue;
       sweep_.range_m[index] = hit.range_m;
@@ -126,7 +134,8 @@ void Caster::Draw(const Candidate& candidate) {
 }
 
 float GroundRange(const Terrain& terrain, const Eigen::Vector3d& o, const Eigen::Vector3d& d, float limit_m) {
-  // Steps that the steepest slope allows; over the shortest step the ground is straight, so the crossing is interpolated.
+  // Steps that the steepest slope allows; over the shortest step the ground is straight, so the crossing is
+  // interpolated.
   constexpr double kShortestStep_m = 0.4;
   const double closing = terrain.steepest() * d.head<2>().norm() - d.z();
   if (closing <= 0) return kInfinity;
@@ -164,7 +173,8 @@ void Caster::DrawGround(const Eigen::Isometry3d& T_world_sensor, const Terrain& 
   }
 }
 
-const Sweep& Caster::Cast(const Eigen::Isometry3d& T_world_sensor, const std::vector<PlacedItem>& items, const Terrain& terrain) {
+const Sweep& Caster::Cast(const Eigen::Isometry3d& T_world_sensor, const std::vector<PlacedItem>& items,
+                          const Terrain& terrain) {
   const std::size_t beams = cos_elevation_.size() * cos_azimuth_.size();
   sweep_.range_m.assign(beams, static_cast<float>(sensor_.max_range_m));
   sweep_.cos_incidence.assign(beams, 1.f);

@@ -29,7 +29,8 @@ class Caster {
   /// Direction of a beam in the sensor's frame.
   Eigen::Vector3f Direction(std::size_t ring, std::size_t column) const;
 
-  const Sweep& Cast(const Eigen::Isometry3d& T_world_sensor, const std::vector<PlacedItem>& items, const Terrain& terrain);
+  const Sweep& Cast(const Eigen::Isometry3d& T_world_sensor, const std::vector<PlacedItem>& items,
+                    const Terrain& terrain);
 
  private:
   struct Window {
@@ -44,7 +45,8 @@ class Caster {
     Eigen::Vector3f origin_prim_m;
   };
 
-  Window WindowOf(const Eigen::Vector3f& centre_sensor_m, const Eigen::Matrix3f& R_sensor_prim, const Eigen::Vector3f& half_m) const;
+  Window WindowOf(const Eigen::Vector3f& centre_sensor_m, const Eigen::Matrix3f& R_sensor_prim,
+                  const Eigen::Vector3f& half_m) const;
   void Collect(const Eigen::Isometry3d& T_world_sensor, const std::vector<PlacedItem>& items);
   void Draw(const Candidate& candidate);
   void DrawGround(const Eigen::Isometry3d& T_world_sensor, const Terrain& terrain);
@@ -56,6 +58,7 @@ class Caster {
 };
 
 /// Range at which a ray meets the ground, infinite beyond limit_m.
-float GroundRange(const Terrain& terrain, const Eigen::Vector3d& origin_m, const Eigen::Vector3d& direction, float limit_m);
+float GroundRange(const Terrain& terrain, const Eigen::Vector3d& origin_m, const Eigen::Vector3d& direction,
+                  float limit_m);
 
 }  // namespace incremental_segmatch::simulator

@@ -98,7 +98,8 @@ std::vector<Pose> MakeDriftingOdometry(const std::vector<Pose>& truth, std::uint
   // Rotation errors bend the path and so cause most of the translation error: first the rotation is brought to its
   // size, then the remaining translation error, and both together if the rotation alone were already too much.
   for (int iteration = 0; iteration < 20; ++iteration) {
-    const DriftMeasure now = MeasureDrift(truth, Integrate(truth, errors, rotation_scale, translation_scale), stretch_m);
+    const DriftMeasure now =
+        MeasureDrift(truth, Integrate(truth, errors, rotation_scale, translation_scale), stretch_m);
     if (now.rotation_deg_per_100m > 0) {
       rotation_scale *= parameters.rotation_deg_per_100m / now.rotation_deg_per_100m;
     }

@@ -11,7 +11,7 @@ namespace incremental_segmatch::simulator {
 
 /// Size of the drift: mean error of the relative pose over 100 m of driving (or half the path, if that is shorter).
 struct DriftParameters {
-  double translation_percent = 0.7;        ///< of the driven path; 0: the odometry is the truth
+  double translation_percent = 0.7;  ///< of the driven path; 0: the odometry is the truth
   double rotation_deg_per_100m = 0.8;
 };
 
@@ -24,9 +24,9 @@ struct DriftMeasure {
 /// Mean relative pose error of `estimate` against `truth` over stretches of stretch_m (all start frames).
 DriftMeasure MeasureDrift(const std::vector<Pose>& truth, const std::vector<Pose>& estimate, double stretch_m);
 
-/// Odometry poses T_odom_sensor; the first is the identity's tilt-preserving twin of the truth: T_odom_sensor(0) keeps the
-/// true roll, pitch and height, and has x = y = yaw = 0. Errors are correlated over about a hundred metres and are scaled so that their
-/// mean is what the parameters ask for.
+/// Odometry poses T_odom_sensor; the first is the identity's tilt-preserving twin of the truth: T_odom_sensor(0) keeps
+/// the true roll, pitch and height, and has x = y = yaw = 0. Errors are correlated over about a hundred metres and are
+/// scaled so that their mean is what the parameters ask for.
 std::vector<Pose> MakeDriftingOdometry(const std::vector<Pose>& T_world_sensor, std::uint64_t seed,
                                        const DriftParameters& parameters);
 

@@ -12,9 +12,23 @@
 namespace incremental_segmatch::simulator {
 
 enum class ItemKind : std::uint8_t {
-  kHouse, kShed, kHedge, kWall, kPicketFence, kTree, kBush, kLamp, kSign, kBollard, kBench, kBin, kBusStop, kUtilityPole,
+  kHouse,
+  kShed,
+  kHedge,
+  kWall,
+  kPicketFence,
+  kTree,
+  kBush,
+  kLamp,
+  kSign,
+  kBollard,
+  kBench,
+  kBin,
+  kBusStop,
+  kUtilityPole,
   kParkingSpot,  ///< a vehicle that depends on the visit
-  kVehicle, kPedestrian
+  kVehicle,
+  kPedestrian
 };
 
 /// A planned thing. Its frame: origin on the ground at the footprint's centre, x along footprint.yaw_rad, z up.
@@ -26,7 +40,8 @@ struct Item {
   std::uint64_t seed = 0;
 };
 
-/// Geometry of an item in its own frame; a deterministic function of its argument. Parking spots have none of their own.
+/// Geometry of an item in its own frame; a deterministic function of its argument. Parking spots have none of their
+/// own.
 std::vector<Primitive> BuildItem(const Item& item);
 
 /// A vehicle of a random make: footprint at the origin, to be placed.

@@ -60,7 +60,8 @@ void WriteScan(const fs::path& path, const SimulatedScan& scan) {
     values.insert(values.end(), {p.x(), p.y(), p.z(), scan.intensities[k]});
   }
   OutputFile file(path);
-  file.stream().write(reinterpret_cast<const char*>(values.data()), static_cast<std::streamsize>(values.size() * sizeof(float)));
+  file.stream().write(reinterpret_cast<const char*>(values.data()),
+                      static_cast<std::streamsize>(values.size() * sizeof(float)));
   file.Close();
 }
 
@@ -83,7 +84,8 @@ void WriteKitti(Simulation& simulation, const std::string& root, const std::stri
     throw std::runtime_error("cannot create the folders of sequence " + sequence + " in " + root);
   }
   WriteCalibration(folder / "calib.txt");
-  OutputFile times(folder / "times.txt"), odometry(folder / "odometry.txt"), poses(fs::path(root) / "poses" / (sequence + ".txt"));
+  OutputFile times(folder / "times.txt"), odometry(folder / "odometry.txt"),
+      poses(fs::path(root) / "poses" / (sequence + ".txt"));
   const Pose Tr = KittiCalibration();
   const Pose T_first_world = simulation.T_world_sensor(0).inverse();
   for (std::size_t i = 0; i < simulation.size(); ++i) {

@@ -114,7 +114,7 @@ inline RayHit IntersectFacade(const Primitive& p, const Vector3f& o, const Vecto
   const int floor = static_cast<int>(std::floor(up / storey));
   if (up < 0 || (column + 1) * pitch > 2 * p.half_m.y() || (floor + 1) * storey > 2 * p.half_m.z() - 1.f) return wall;
   const std::uint64_t hash = HashOf(p.seed, static_cast<std::uint64_t>(column), static_cast<std::uint64_t>(floor));
-  if ((hash & 7) == 0) return wall;                                    // no opening here
+  if ((hash & 7) == 0) return wall;  // no opening here
   const bool door = floor == 0 && ((hash >> 3) & 7) == 0;
   const float half_width = 0.5f * width * (0.75f + 0.5f * static_cast<float>((hash >> 8) & 255) / 255.f);
   const float middle = (column + 0.5f) * pitch + 0.2f * (static_cast<float>((hash >> 16) & 255) / 255.f - 0.5f) * pitch;
@@ -216,22 +216,24 @@ inline RayHit IntersectFoliage(const Primitive& p, const Vector3f& o, const Vect
   const int shift[3] = {static_cast<int>(p.seed & 15), static_cast<int>((p.seed >> 4) & 15),
                         static_cast<int>((p.seed >> 8) & 15)};
   for (float t = t0; t < t1;) {
+    const int axis = next[0] < next[1] ? (next[0] < next[2] ? 0 : 2) : (next[1] < next[2] ? 1 : 2);
     const std::size_t index = static_cast<std::size_t>(((at[0] + shift[0]) & 15) | (((at[1] + shift[1]) & 15) << 4) |
                                                        (((at[2] + shift[2]) & 15) << 8));
     const Leaf& leaf = leaves[index];
-    const Vector3f centre = leaf.centre + Vector3f(static_cast<float>(at[0]), static_cast<float>(at[1]),
-                                                   static_cast<float>(at[2]));
+    const Vector3f centre =
+        leaf.centre + Vector3f(static_cast<float>(at[0]), static_cast<float>(at[1]), static_cast<float>(at[2]));
     // Leaves hang at the rim of a crown, few grow inside.
     const Vector3f from_middle = centre.cwiseProduct(inverse_half) - Vector3f::Ones();
     const float outwards = ellipsoid ? from_middle.squaredNorm() : from_middle.cwiseAbs().maxCoeff();
     if (leaf.threshold < density * (0.35f + 0.65f * outwards)) {
       const float towards = leaf.normal.dot(d);
       const float hit = leaf.normal.dot(centre - origin) / (std::abs(towards) > 1e-6f ? towards : 1e-6f);
-      if (hit > t0 && hit < t1 && (origin + hit * d - centre).squaredNorm() < leaf.radius_squared) {
+      // Leaves end at their cell: so the first hit found is the nearest.
+      if (hit >= t && hit < std::min(t1, next[axis]) &&
+          (origin + hit * d - centre).squaredNorm() < leaf.radius_squared) {
         return {hit * cell, std::max(0.3f, std::abs(towards)), p.material};
       }
     }
-    const int axis = next[0] < next[1] ? (next[0] < next[2] ? 0 : 2) : (next[1] < next[2] ? 1 : 2);
     t = next[axis];
     next[axis] += delta[axis];
     at[axis] += step[axis];
@@ -262,7 +264,8 @@ Primitive Primitive::Frustum(const Vector3f& centre_m, float half_height_m, cons
   p.shape = Shape::kFrustum;
   p.material = material;
   p.centre_m = centre_m;
-  p.half_m = {std::max(bottom_m.x(), top_m.x() + std::abs(top_shift_m)), std::max(bottom_m.y(), top_m.y()), half_height_m};
+  p.half_m = {std::max(bottom_m.x(), top_m.x() + std::abs(top_shift_m)), std::max(bottom_m.y(), top_m.y()),
+              half_height_m};
   const float q[] = {bottom_m.x(), bottom_m.y(), top_m.x(), top_m.y(), top_shift_m};
   std::copy(std::begin(q), std::end(q), p.parameters);
   return p;
@@ -290,7 +293,8 @@ Primitive Primitive::Facade(const Vector3f& centre_m, float facing_rad, float ha
   p.centre_m = centre_m;
   p.R_item_prim = TurnAboutZ(facing_rad);
   p.half_m = {windows.recess_m, half_width_m, half_height_m};
-  const float q[] = {windows.pitch_m, windows.width_m, windows.sill_m, windows.height_m, windows.recess_m, windows.storey_m};
+  const float q[] = {windows.pitch_m,  windows.width_m,  windows.sill_m,
+                     windows.height_m, windows.recess_m, windows.storey_m};
   std::copy(std::begin(q), std::end(q), p.parameters);
   return p;
 }
@@ -324,12 +328,18 @@ Primitive Primitive::Foliage(const Vector3f& centre_m, const Vector3f& half_m, b
 
 RayHit Intersect(const Primitive& primitive, const Vector3f& origin_m, const Vector3f& direction, float limit_m) {
   switch (primitive.shape) {
-    case Shape::kBox: return IntersectBox(primitive, origin_m, direction, limit_m);
-    case Shape::kFrustum: return IntersectFrustum(primitive, origin_m, direction, limit_m);
-    case Shape::kCylinder: return IntersectCylinder(primitive, origin_m, direction, limit_m);
-    case Shape::kFacade: return IntersectFacade(primitive, origin_m, direction, limit_m);
-    case Shape::kPickets: return IntersectPickets(primitive, origin_m, direction, limit_m);
-    case Shape::kFoliage: return IntersectFoliage(primitive, origin_m, direction, limit_m);
+    case Shape::kBox:
+      return IntersectBox(primitive, origin_m, direction, limit_m);
+    case Shape::kFrustum:
+      return IntersectFrustum(primitive, origin_m, direction, limit_m);
+    case Shape::kCylinder:
+      return IntersectCylinder(primitive, origin_m, direction, limit_m);
+    case Shape::kFacade:
+      return IntersectFacade(primitive, origin_m, direction, limit_m);
+    case Shape::kPickets:
+      return IntersectPickets(primitive, origin_m, direction, limit_m);
+    case Shape::kFoliage:
+      return IntersectFoliage(primitive, origin_m, direction, limit_m);
   }
   return {};
 }

@@ -18,7 +18,20 @@ enum class Shape : std::uint8_t {
   kFoliage,   ///< leaves scattered through an ellipsoid or a box
 };
 
-enum class Material : std::uint8_t { kRoad, kGrass, kPlaster, kBrick, kWood, kBark, kLeaf, kMetal, kCarGlass, kWindow, kRetro, kCloth };
+enum class Material : std::uint8_t {
+  kRoad,
+  kGrass,
+  kPlaster,
+  kBrick,
+  kWood,
+  kBark,
+  kLeaf,
+  kMetal,
+  kCarGlass,
+  kWindow,
+  kRetro,
+  kCloth
+};
 
 /// Where a ray meets a surface; range is infinite if it does not.
 struct RayHit {
@@ -31,18 +44,19 @@ struct RayHit {
 struct Primitive {
   Shape shape = Shape::kBox;
   Material material = Material::kPlaster;
-  std::uint32_t seed = 0;                                 ///< of window patterns and leaves
+  std::uint32_t seed = 0;  ///< of window patterns and leaves
   Eigen::Matrix3f R_item_prim = Eigen::Matrix3f::Identity();
-  Eigen::Vector3f centre_m = Eigen::Vector3f::Zero();     ///< in the item's frame
-  Eigen::Vector3f half_m = Eigen::Vector3f::Zero();       ///< bounding half sizes in the primitive's frame
-  float parameters[6] = {};                               ///< per shape, see the makers below
+  Eigen::Vector3f centre_m = Eigen::Vector3f::Zero();  ///< in the item's frame
+  Eigen::Vector3f half_m = Eigen::Vector3f::Zero();    ///< bounding half sizes in the primitive's frame
+  float parameters[6] = {};                            ///< per shape, see the makers below
 
   static Primitive Box(const Eigen::Vector3f& centre_m, const Eigen::Vector3f& half_m, Material material);
   /// Bottom rectangle of half sizes `bottom_m` at -half_height, top of `top_m` shifted by top_shift_m along x.
   static Primitive Frustum(const Eigen::Vector3f& centre_m, float half_height_m, const Eigen::Vector2f& bottom_m,
                            const Eigen::Vector2f& top_m, float top_shift_m, Material material);
   /// From `from_m` to `to_m`, in the item's frame.
-  static Primitive Cylinder(const Eigen::Vector3f& from_m, const Eigen::Vector3f& to_m, float radius_m, Material material);
+  static Primitive Cylinder(const Eigen::Vector3f& from_m, const Eigen::Vector3f& to_m, float radius_m,
+                            Material material);
   /// Windows of a facade; all in metres. A share of openings is missing, and a share of the rest has closed shutters.
   struct Windows {
     float pitch_m, width_m, sill_m, height_m, recess_m, storey_m;

@@ -16,11 +16,17 @@ inline std::uint64_t Mix(std::uint64_t x) {
 }
 
 /// Hash of several integers, order matters.
-inline std::uint64_t HashOf(std::uint64_t a, std::uint64_t b) { return Mix(Mix(a) ^ (b * 0xff51afd7ed558ccdULL)); }
-inline std::uint64_t HashOf(std::uint64_t a, std::uint64_t b, std::uint64_t c) { return HashOf(HashOf(a, b), c); }
+inline std::uint64_t HashOf(std::uint64_t a, std::uint64_t b) {
+  return Mix(Mix(a) ^ (b * 0xff51afd7ed558ccdULL));
+}
+inline std::uint64_t HashOf(std::uint64_t a, std::uint64_t b, std::uint64_t c) {
+  return HashOf(HashOf(a, b), c);
+}
 
 /// Uniform in [0, 1) from the upper bits of a hash.
-inline double ToUnit(std::uint64_t hash) { return static_cast<double>(hash >> 11) * 0x1.0p-53; }
+inline double ToUnit(std::uint64_t hash) {
+  return static_cast<double>(hash >> 11) * 0x1.0p-53;
+}
 
 /// A small stream of random numbers from one seed.
 class Random {

@@ -9,15 +9,17 @@
 namespace incremental_segmatch::simulator {
 namespace {
 
-constexpr double kLaneOffset_m = 1.75;      // the vehicle keeps to the right of the road's axis
-constexpr double kCornerRadius_m = 9.0;     // of the road's axis
-constexpr double kStep_m = 0.25;            // sampling of the path before it is driven
+constexpr double kLaneOffset_m = 1.75;   // the vehicle keeps to the right of the road's axis
+constexpr double kCornerRadius_m = 9.0;  // of the road's axis
+constexpr double kStep_m = 0.25;         // sampling of the path before it is driven
 constexpr double kLateralLimit_m_s2 = 2.0;
 constexpr double kBrakeLimit_m_s2 = 1.5;
 
 using Path = std::vector<Eigen::Vector2d>;
 
-double Cross(const Eigen::Vector2d& a, const Eigen::Vector2d& b) { return a.x() * b.y() - a.y() * b.x(); }
+double Cross(const Eigen::Vector2d& a, const Eigen::Vector2d& b) {
+  return a.x() * b.y() - a.y() * b.x();
+}
 
 void AppendLine(Path& path, const Eigen::Vector2d& to) {
   const Eigen::Vector2d from = path.back();
@@ -26,7 +28,8 @@ void AppendLine(Path& path, const Eigen::Vector2d& to) {
   for (int i = 1; i <= steps; ++i) path.push_back(from + (to - from) * (static_cast<double>(i) / steps));
 }
 
-// The arc of the driven lane around a corner of the axis: tangent to both legs at kCornerRadius_m from the axis's arc centre.
+// The arc of the driven lane around a corner of the axis: tangent to both legs at kCornerRadius_m from the axis's arc
+// centre.
 void AppendCorner(Path& path, const Eigen::Vector2d& corner, const Eigen::Vector2d& in, const Eigen::Vector2d& out) {
   const double turn = std::atan2(Cross(in, out), in.dot(out));
   const double side = turn > 0 ? 1.0 : -1.0;
@@ -113,9 +116,26 @@ Eigen::Vector2d Node(int column, int row) {
 
 Corners LoopsCorners() {
   // Around two blocks, then same-direction revisits of three streets, with one street the other way.
-  return {Node(0, 0) + Eigen::Vector2d(15, 0), Node(1, 0), Node(2, 0), Node(2, 1), Node(1, 1), Node(0, 1),
-          Node(0, 0), Node(1, 0), Node(1, 1), Node(2, 1), Node(3, 1), Node(3, 0), Node(2, 0), Node(2, 1), Node(1, 1),
-          Node(1, 2), Node(0, 2), Node(0, 1), Node(0, 0), Node(1, 0) - Eigen::Vector2d(15, 0)};
+  return {Node(0, 0) + Eigen::Vector2d(15, 0),
+          Node(1, 0),
+          Node(2, 0),
+          Node(2, 1),
+          Node(1, 1),
+          Node(0, 1),
+          Node(0, 0),
+          Node(1, 0),
+          Node(1, 1),
+          Node(2, 1),
+          Node(3, 1),
+          Node(3, 0),
+          Node(2, 0),
+          Node(2, 1),
+          Node(1, 1),
+          Node(1, 2),
+          Node(0, 2),
+          Node(0, 1),
+          Node(0, 0),
+          Node(1, 0) - Eigen::Vector2d(15, 0)};
 }
 
 Corners OppositeCorners() {
@@ -149,7 +169,9 @@ Corners LapCorners(int laps) {
 
 }  // namespace
 
-std::vector<std::string> PresetRouteNames() { return {"loops", "opposite", "deceptive", "lap"}; }
+std::vector<std::string> PresetRouteNames() {
+  return {"loops", "opposite", "deceptive", "lap"};
+}
 
 Route MakePresetRoute(const std::string& name, const RouteParameters& parameters) {
   if (!(parameters.frame_rate_hz > 0)) throw std::invalid_argument("scan rate must be positive");
@@ -159,7 +181,8 @@ Route MakePresetRoute(const std::string& name, const RouteParameters& parameters
   if (name == "opposite") return Drive(LaneAlong(OppositeCorners()), parameters);
   if (name == "deceptive") return Drive(LaneAlong(DeceptiveCorners()), parameters);
   if (name == "lap") return Drive(LaneAlong(LapCorners(parameters.laps)), parameters);
-  throw std::invalid_argument("unknown route '" + name + "': use loops, opposite, deceptive or lap, or give a pose file");
+  throw std::invalid_argument("unknown route '" + name +
+                              "': use loops, opposite, deceptive or lap, or give a pose file");
 }
 
 Route RouteFromKittiPoses(const std::string& file, double frame_rate_hz) {

@@ -33,8 +33,8 @@ std::vector<std::string> PresetRouteNames();
 /// A preset route; throws std::invalid_argument for an unknown name or a non-positive rate or speed.
 Route MakePresetRoute(const std::string& name, const RouteParameters& parameters);
 
-/// The route along a KITTI pose file (rows of 3x4 camera poses, x right, y down, z forward), one frame a row at frame_rate_hz.
-/// Heights and tilts of the file are not used. Throws std::runtime_error naming the file.
+/// The route along a KITTI pose file (rows of 3x4 camera poses, x right, y down, z forward), one frame a row at
+/// frame_rate_hz. Heights and tilts of the file are not used. Throws std::runtime_error naming the file.
 Route RouteFromKittiPoses(const std::string& file, double frame_rate_hz);
 
 }  // namespace incremental_segmatch::simulator

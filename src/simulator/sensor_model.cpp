@@ -16,7 +16,9 @@ void AppendBeams(std::vector<double>& elevations_rad, int count, double top_deg,
 
 }  // namespace
 
-std::vector<std::string> SensorNames() { return {"HDL-64E", "HDL-32E", "VLP-16", "OS1-128"}; }
+std::vector<std::string> SensorNames() {
+  return {"HDL-64E", "HDL-32E", "VLP-16", "OS1-128"};
+}
 
 SensorModel SensorByName(const std::string& name) {
   SensorModel model;

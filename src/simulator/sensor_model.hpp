@@ -14,8 +14,8 @@ struct SensorModel {
   int columns = 0;                     ///< firings in one turn, counter-clockwise from the x axis
   double min_range_m = 1.0;
   double max_range_m = 120.0;
-  double range_noise_m = 0.02;     ///< standard deviation
-  double dropout = 0.02;           ///< share of beams lost at near range and steep incidence
+  double range_noise_m = 0.02;  ///< standard deviation
+  double dropout = 0.02;        ///< share of beams lost at near range and steep incidence
 };
 
 /// Names that SensorByName knows: HDL-64E, HDL-32E, VLP-16, OS1-128.

@@ -20,7 +20,8 @@ void Check(const SimulationOptions& options) {
   Check(options.stride >= 1, "stride must be at least 1");
   Check(options.frame_rate_hz > 0, "scan rate must be positive");
   Check(options.sensor_height_m > 0, "sensor height must be positive");
-  Check(options.drift.translation_percent >= 0 && options.drift.rotation_deg_per_100m >= 0, "drift must not be negative");
+  Check(options.drift.translation_percent >= 0 && options.drift.rotation_deg_per_100m >= 0,
+        "drift must not be negative");
   Check(options.range_noise_m >= 0, "range noise must not be negative");
   Check(options.dropout >= 0 && options.dropout < 1, "drop-out must be in [0, 1)");
   Check(options.town.grade >= 0 && options.town.grade <= 0.2, "grade must be in [0, 0.2]");
@@ -53,24 +54,37 @@ Pose SensorPose(const RouteFrame& frame, const Terrain& terrain, double height_m
   pose.linear() << x, up.cross(x), up;
   pose.linear() = pose.linear() * Eigen::AngleAxisd(0.002 * sway(1, 0.9), Eigen::Vector3d::UnitY()).toRotationMatrix() *
                   Eigen::AngleAxisd(0.002 * sway(2, 0.7), Eigen::Vector3d::UnitX()).toRotationMatrix();
-  pose.translation() << frame.position_m, terrain.Height(frame.position_m.x(), frame.position_m.y()) + height_m + 0.008 * sway(3, 1.3);
+  pose.translation() << frame.position_m,
+      terrain.Height(frame.position_m.x(), frame.position_m.y()) + height_m + 0.008 * sway(3, 1.3);
   return pose;
 }
 
 float Reflectivity(Material material) {
   switch (material) {
-    case Material::kRoad: return 0.22f;
-    case Material::kGrass: return 0.4f;
-    case Material::kPlaster: return 0.5f;
-    case Material::kBrick: return 0.35f;
-    case Material::kWood: return 0.4f;
-    case Material::kBark: return 0.3f;
-    case Material::kLeaf: return 0.35f;
-    case Material::kMetal: return 0.25f;
-    case Material::kCarGlass: return 0.1f;
-    case Material::kWindow: return 0.1f;
-    case Material::kRetro: return 0.98f;
-    case Material::kCloth: return 0.3f;
+    case Material::kRoad:
+      return 0.22f;
+    case Material::kGrass:
+      return 0.4f;
+    case Material::kPlaster:
+      return 0.5f;
+    case Material::kBrick:
+      return 0.35f;
+    case Material::kWood:
+      return 0.4f;
+    case Material::kBark:
+      return 0.3f;
+    case Material::kLeaf:
+      return 0.35f;
+    case Material::kMetal:
+      return 0.25f;
+    case Material::kCarGlass:
+      return 0.1f;
+    case Material::kWindow:
+      return 0.1f;
+    case Material::kRetro:
+      return 0.98f;
+    case Material::kCloth:
+      return 0.3f;
   }
   return 0.f;
 }
@@ -104,7 +118,8 @@ class Simulation::Impl {
     sensor_.dropout = options.dropout;
     const std::uint64_t own_seed = HashOf(options.seed, 5005, options.day);
     std::vector<Pose> truth;
-    for (const RouteFrame& frame : route_) truth.push_back(SensorPose(frame, town_.terrain(), options.sensor_height_m, own_seed));
+    for (const RouteFrame& frame : route_)
+      truth.push_back(SensorPose(frame, town_.terrain(), options.sensor_height_m, own_seed));
     // Drift is drawn over all frames of the route, so that it does not depend on which of them are kept.
     const std::vector<Pose> odometry = MakeDriftingOdometry(truth, own_seed, options.drift);
     for (std::size_t i = options.first_frame; i < route_.size(); i += options.stride) {
@@ -114,7 +129,8 @@ class Simulation::Impl {
       truth_.push_back(truth[i]);
       odometry_.push_back(odometry[i]);
     }
-    if (truth_.empty()) throw std::invalid_argument("the route has no frame after the first " + std::to_string(options.first_frame));
+    if (truth_.empty())
+      throw std::invalid_argument("the route has no frame after the first " + std::to_string(options.first_frame));
   }
 
   SimulatedScan Scan(std::size_t i) {
@@ -123,7 +139,8 @@ class Simulation::Impl {
     const Sweep& sweep = caster_.Cast(pose, items, town_.terrain());
     const std::uint64_t seed = HashOf(options_.seed, 6006 + options_.day, static_cast<std::uint64_t>(stamps_[i]));
     const float noise = static_cast<float>(sensor_.range_noise_m), dropout = static_cast<float>(sensor_.dropout);
-    const float max_range = static_cast<float>(sensor_.max_range_m), min_range = static_cast<float>(sensor_.min_range_m);
+    const float max_range = static_cast<float>(sensor_.max_range_m),
+                min_range = static_cast<float>(sensor_.min_range_m);
     SimulatedScan scan;
     scan.points_sensor.reserve(sweep.range_m.size());
     scan.intensities.reserve(sweep.range_m.size());
@@ -159,12 +176,26 @@ Simulation::~Simulation() = default;
 Simulation::Simulation(Simulation&&) noexcept = default;
 Simulation& Simulation::operator=(Simulation&&) noexcept = default;
 
-std::size_t Simulation::size() const { return impl_->truth_.size(); }
-StampNs Simulation::stamp_ns(std::size_t i) const { return impl_->stamps_.at(i); }
-const Pose& Simulation::T_world_sensor(std::size_t i) const { return impl_->truth_.at(i); }
-const Pose& Simulation::T_odom_sensor(std::size_t i) const { return impl_->odometry_.at(i); }
-Points Simulation::Scan(std::size_t i) { return impl_->Scan(i).points_sensor; }
-SimulatedScan Simulation::ScanWithIntensities(std::size_t i) { return impl_->Scan(i); }
-const Town& Simulation::town() const { return impl_->town_; }
+std::size_t Simulation::size() const {
+  return impl_->truth_.size();
+}
+StampNs Simulation::stamp_ns(std::size_t i) const {
+  return impl_->stamps_.at(i);
+}
+const Pose& Simulation::T_world_sensor(std::size_t i) const {
+  return impl_->truth_.at(i);
+}
+const Pose& Simulation::T_odom_sensor(std::size_t i) const {
+  return impl_->odometry_.at(i);
+}
+Points Simulation::Scan(std::size_t i) {
+  return impl_->Scan(i).points_sensor;
+}
+SimulatedScan Simulation::ScanWithIntensities(std::size_t i) {
+  return impl_->Scan(i);
+}
+const Town& Simulation::town() const {
+  return impl_->town_;
+}
 
 }  // namespace incremental_segmatch::simulator

@@ -9,8 +9,8 @@ namespace incremental_segmatch::simulator {
 namespace {
 
 constexpr double kCell_m = 32.0;
-constexpr double kMargin_m = 150.0;         // ground around the path
-constexpr double kForget_m = 250.0;         // geometry farther than this is dropped
+constexpr double kMargin_m = 150.0;  // ground around the path
+constexpr double kForget_m = 250.0;  // geometry farther than this is dropped
 constexpr double kVisitRadius_m = 80.0;
 constexpr double kVisitGap_s = 20.0;
 constexpr double kChangeGap_s = 60.0;
@@ -19,7 +19,8 @@ constexpr double kMeetingSpan_s = 9.0;
 constexpr double kOncomingLane_m = 3.5;
 
 std::uint64_t CellKey(const Eigen::Vector2d& p) {
-  const auto x = static_cast<std::int64_t>(std::floor(p.x() / kCell_m)), y = static_cast<std::int64_t>(std::floor(p.y() / kCell_m));
+  const auto x = static_cast<std::int64_t>(std::floor(p.x() / kCell_m)),
+             y = static_cast<std::int64_t>(std::floor(p.y() / kCell_m));
   return (static_cast<std::uint64_t>(x) << 32) ^ (static_cast<std::uint64_t>(y) & 0xffffffffULL);
 }
 
@@ -62,7 +63,7 @@ void Town::PlanTraffic() {
     Item person;
     person.kind = ItemKind::kPedestrian;
     person.height_m = random.Uniform(1.5, 1.9);
-    const double lateral = random.Chance(0.5) ? random.Uniform(8.8, 9.6) : -random.Uniform(5.3, 6.1);
+    const double lateral = random.Chance(0.5) ? random.Uniform(8.2, 8.8) : -random.Uniform(4.7, 5.3);
     walkers_.push_back({random.Uniform(0.0, samples.back().path_m), lateral, random.Uniform(-1.6, 1.6), person});
   }
 }
@@ -146,7 +147,8 @@ std::vector<PlacedItem> Town::ItemsNear(const Eigen::Vector2d& position_m, doubl
   return items;
 }
 
-void Town::AppendTraffic(const Eigen::Vector2d& position_m, double radius_m, double time_s, std::vector<PlacedItem>& items) const {
+void Town::AppendTraffic(const Eigen::Vector2d& position_m, double radius_m, double time_s,
+                         std::vector<PlacedItem>& items) const {
   const auto place = [&](Item item, double path_m, double lateral_m, bool backwards) {
     const PathSample& sample = trajectory_.AtPath(path_m);
     const Eigen::Vector2d left(-std::sin(sample.yaw_rad), std::cos(sample.yaw_rad));

@@ -15,13 +15,13 @@
 namespace incremental_segmatch::simulator {
 
 struct TownParameters {
-  std::uint64_t seed = 1;             ///< of everything that stands still
-  std::uint64_t day = 0;              ///< another day: other parked cars and traffic in the same town
-  double grade = 0.04;                ///< steepest slope of the ground
-  double parked_change = 0.4;         ///< chance that a parking spot changes between two visits more than 60 s apart
-  double meetings_per_minute = 6.0;   ///< with oncoming vehicles
+  std::uint64_t seed = 1;            ///< of everything that stands still
+  std::uint64_t day = 0;             ///< another day: other parked cars and traffic in the same town
+  double grade = 0.04;               ///< steepest slope of the ground
+  double parked_change = 0.4;        ///< chance that a parking spot changes between two visits more than 60 s apart
+  double meetings_per_minute = 6.0;  ///< with oncoming vehicles
   double pedestrians_per_100m = 2.0;
-  bool look_alike = false;            ///< equal houses, trees and cars at equal distances
+  bool look_alike = false;  ///< equal houses, trees and cars at equal distances
 };
 
 /// Geometry and where it is now.
@@ -59,7 +59,8 @@ class Town {
 
   PlacedItem Place(const Item& item, std::shared_ptr<const std::vector<Primitive>> primitives) const;
   void PlanTraffic();
-  void AppendTraffic(const Eigen::Vector2d& position_m, double radius_m, double time_s, std::vector<PlacedItem>& items) const;
+  void AppendTraffic(const Eigen::Vector2d& position_m, double radius_m, double time_s,
+                     std::vector<PlacedItem>& items) const;
   void ForgetFar(const Eigen::Vector2d& position_m);
 
   TownParameters parameters_;

@@ -13,9 +13,13 @@ std::uint64_t Key(std::int64_t x, std::int64_t y) {
   return (static_cast<std::uint64_t>(x) << 32) ^ (static_cast<std::uint64_t>(y) & 0xffffffffULL);
 }
 
-std::int64_t CellOf(double v) { return static_cast<std::int64_t>(std::floor(v / kCell_m)); }
+std::int64_t CellOf(double v) {
+  return static_cast<std::int64_t>(std::floor(v / kCell_m));
+}
 
-Eigen::Vector2d Axis(double yaw) { return {std::cos(yaw), std::sin(yaw)}; }
+Eigen::Vector2d Axis(double yaw) {
+  return {std::cos(yaw), std::sin(yaw)};
+}
 
 double DistanceToPoint(const Footprint& footprint, const Eigen::Vector2d& point) {
   const Eigen::Vector2d x = Axis(footprint.yaw_rad);
@@ -50,8 +54,8 @@ TrajectoryIndex::TrajectoryIndex(const Route& route) {
     const double turn = std::remainder(route[i + 1].yaw_rad - route[i].yaw_rad, 6.283185307179586);
     for (; due_m < path_m + length; due_m += kSpacing_m) {
       const double share = (due_m - path_m) / length;
-      samples_.push_back({route[i].position_m + share * step, route[i].yaw_rad + share * turn, due_m,
-                          begin_s + share * duration_s});
+      samples_.push_back(
+          {route[i].position_m + share * step, route[i].yaw_rad + share * turn, due_m, begin_s + share * duration_s});
     }
     path_m += length;
   }
@@ -84,8 +88,8 @@ double TrajectoryIndex::Distance(const Footprint& footprint, double limit_m) con
 bool TrajectoryIndex::WasHereBefore(const PathSample& sample, double radius_m, double min_path_m) const {
   bool found = false;
   ForEachNear(sample.position_m, radius_m, [&](const PathSample& other) {
-    found = found || (other.path_m < sample.path_m - min_path_m &&
-                      (other.position_m - sample.position_m).norm() < radius_m);
+    found = found ||
+            (other.path_m < sample.path_m - min_path_m && (other.position_m - sample.position_m).norm() < radius_m);
   });
   return found;
 }
