@@ -2,17 +2,17 @@
 /// Map side: changed segments of any number of robots to recognitions; owns the target map (METHOD 4 and 5).
 #pragma once
 
+#include <map>
 #include <optional>
-#include <set>
 #include <string>
 #include <unordered_map>
 #include <vector>
 
-#include "incremental_segmatch/descriptor_index.hpp"
 #include "incremental_segmatch/point_refinement.hpp"
 #include "incremental_segmatch/recognizer.hpp"
 #include "incremental_segmatch/segment_delta.hpp"
 #include "incremental_segmatch/stage_times.hpp"
+#include "incremental_segmatch/target_index.hpp"
 #include "incremental_segmatch/target_map.hpp"
 #include "incremental_segmatch/types.hpp"
 
@@ -27,6 +27,7 @@ struct MatchingParameters {
   int nearest = 25;                  ///< candidates of a local segment: so many nearest; 0: no limit
   double max_distance = 0.0;         ///< and within this scaled descriptor distance; 0: no limit
   double time_window_s = 60.0;       ///< own segments seen more recently are no targets (loop closure)
+  double min_path_m = 50.0;          ///< nor are those seen less than this much of path ago
   double requery_distance = 0.2;     ///< a segment is matched anew once its scaled descriptor moved so far
 };
 
@@ -106,32 +107,60 @@ class BackEnd {
   std::size_t memory_bytes() const;
 
  private:
+  // A tracked segment of a robot's local map.
   struct LocalSegment {
-    Eigen::Vector3d centroid_odom;
+    Eigen::Vector3d centroid_odom = Eigen::Vector3d::Zero();
     Descriptor descriptor;
-    std::uint32_t size = 0;
-    std::shared_ptr<const Points> points_centroid;   ///< of its newest view
-    Eigen::Vector3d points_origin_odom;              ///< centroid that those points are relative to
-    Descriptor queried;                              ///< descriptor at the last query; empty: never
-    std::vector<std::pair<SegmentKey, float>> candidates;
-    std::optional<SegmentKey> same_as;               ///< target segment that it was recognised as
+    StampNs last_seen_ns = 0;
+    double last_seen_path_m = 0.0;
+    std::shared_ptr<const Points> points_centroid;                       // of its newest view
+    Eigen::Vector3d points_origin_odom = Eigen::Vector3d::Zero();        // what those points are relative to
+    std::optional<SegmentKey> same_as;                                   // target segment that it was recognised as
+    Descriptor queried;                                                  // descriptor at the last query; empty: never
+    std::uint64_t queried_generation = 0;
+    std::uint64_t next_item = 0;                                         // of the index at the last look
+    std::vector<TargetCandidate> candidates;                             // nearest first
   };
-  using LocalMap = std::map<SegmentId, LocalSegment>;
-
   struct Robot {
-    std::uint64_t sequence = 0;
+    std::string name;
+    RobotIndex frame = 0;                                                // robots with the same value share a map frame
     bool started = false;
-    LocalMap local;
+    std::uint64_t sequence = 0;
+    double path_m = 0.0;
+    std::vector<double> path_at_pose_m;                                  // in loop closure, by index of trajectory pose
+    Pose T_odom_sensor = Pose::Identity();
+    std::map<SegmentId, LocalSegment> local;
+  };
+  // A segment that is no longer tracked, and waits for the time window to pass.
+  struct Waiting {
+    SegmentKey segment;
+    double last_seen_path_m = 0.0;
   };
 
-  bool ApplyDelta(const SegmentDelta& delta, RobotIndex robot);
+  RobotIndex RobotByName(const std::string& name);
+  bool IsLoopClosure() const { return parameters_.mode == Mode::kLoopClosure; }
+  void ApplyDelta(const SegmentDelta& delta, RobotIndex robot);
+  void RetireSegment(RobotIndex robot, const RetiredSegment& retired);
+  void RenameSegment(RobotIndex robot, const RenamedSegment& renamed);
+  void UpdateSegment(RobotIndex robot, const SegmentState& state, const SegmentDelta& delta);
   void ReleaseTargets(StampNs now_ns);
-  void MatchSegments(RobotIndex robot, BackEndCounts* counts);
+  bool MatchSegment(RobotIndex robot, LocalSegment* segment) const;
+  bool NeedsQuery(RobotIndex robot, const LocalSegment& segment) const;
+  std::map<RobotIndex, Correspondences> CollectCorrespondences(RobotIndex robot) const;
+  RecognizerResult Recognize(RobotIndex robot, const std::map<RobotIndex, Correspondences>& by_frame);
+  const SegmentView& MatchedView(RobotIndex robot, const Correspondence& inlier) const;
+  std::optional<RefinedTransform> Refine(RobotIndex robot, const Recognition& recognition) const;
+  std::optional<LoopClosure> MakeClosure(RobotIndex robot, StampNs stamp_ns, const Recognition& recognition) const;
+  void AcceptRecognition(RobotIndex robot, const Recognition& recognition);
+  void JoinFrames(RobotIndex robot, RobotIndex target_robot, const Pose& T_map_odom);
 
   BackEndParameters parameters_;
   TargetMap map_;
-  Recognizer recognizer_;
-  std::vector<Robot> robots_;
+  TargetIndex index_;
+  std::map<std::pair<RobotIndex, RobotIndex>, Recognizer> recognizers_;  // by robot and frame of its targets
+  std::vector<Robot> robots_;                                            // by RobotIndex; those of a loaded map come first
+  RobotIndex loaded_robots_ = 0;
+  std::multimap<StampNs, Waiting> waiting_;                              // by when they were last seen
 };
 
 }  // namespace incremental_segmatch

@@ -1,0 +1,102 @@
+#include "incremental_segmatch/target_index.hpp"
+
+#include <algorithm>
+#include <limits>
+#include <stdexcept>
+#include <string>
+#include <tuple>
+#include <unordered_set>
+#include <utility>
+
+namespace incremental_segmatch {
+
+void TargetIndex::Add(const SegmentKey& segment, const TargetMap& map, bool released) {
+  Remove(segment);
+  const TargetSegment* target = map.Find(segment);
+  if (target == nullptr) throw std::invalid_argument("segment " + std::to_string(segment.id) + " is not in the map");
+  for (std::uint32_t i = 0; i < target->views.size(); ++i)
+    Insert({segment, i, target->views[i].descriptor, map.CentroidMap(target->views[i]), true, released});
+  if (index_->size() >= rescale_at_) Rescale();
+}
+
+void TargetIndex::Remove(const SegmentKey& segment) {
+  const auto found = items_.find(segment);
+  if (found == items_.end()) return;
+  for (const std::uint64_t item : found->second) {
+    index_->Remove(item);
+    views_[item].live = false;
+    views_[item].descriptor = Descriptor();
+  }
+  items_.erase(found);
+}
+
+void TargetIndex::RefreshCentroids(const TargetMap& map) {
+  for (const auto& [segment, items] : items_) {
+    const TargetSegment* target = map.Find(segment);
+    for (const std::uint64_t item : items) views_[item].centroid_map = map.CentroidMap(target->views[views_[item].view]);
+  }
+}
+
+std::vector<TargetCandidate> TargetIndex::Nearest(const Descriptor& query, RobotIndex robot, std::size_t count,
+                                                  float max_distance) const {
+  if (!index_) return {};
+  const Descriptor scaled = query.cwiseProduct(weights_);
+  // Several of the nearest views may belong to one segment, or be closed to the robot: look on until there are enough segments.
+  for (std::size_t wanted = count == 0 ? index_->size() : 2 * count;; wanted *= 2) {
+    const std::vector<DescriptorMatch> matches = index_->Nearest(scaled, wanted, max_distance);
+    std::unordered_set<SegmentKey, SegmentKeyHash> seen;
+    std::vector<TargetCandidate> candidates;
+    for (const DescriptorMatch& match : matches) {
+      const SegmentKey& segment = views_[match.item].segment;
+      if (IsOpen(match.item, robot) && seen.insert(segment).second) candidates.push_back({match.item, segment, match.distance});
+    }
+    const bool exhausted = matches.size() < wanted || wanted >= index_->size();
+    if (!exhausted && candidates.size() < count) continue;
+    std::sort(candidates.begin(), candidates.end(), [](const TargetCandidate& a, const TargetCandidate& b) {
+      return std::tie(a.distance, a.segment) < std::tie(b.distance, b.segment);
+    });
+    if (count != 0 && candidates.size() > count) candidates.resize(count);
+    return candidates;
+  }
+}
+
+void TargetIndex::Insert(IndexedView view) {
+  if (!index_) {
+    weights_ = Descriptor::Ones(view.descriptor.size());
+    index_.emplace(static_cast<std::size_t>(weights_.size()));
+  }
+  if (view.descriptor.size() != weights_.size())
+    throw std::invalid_argument("a descriptor of " + std::to_string(view.descriptor.size()) + " values does not fit the map's " +
+                                std::to_string(weights_.size()) + ": use the descriptor settings that the map was made with");
+  const std::uint64_t item = views_.size();
+  items_[view.segment].push_back(item);
+  index_->Insert(item, view.descriptor.cwiseProduct(weights_));
+  views_.push_back(std::move(view));
+}
+
+void TargetIndex::Rescale() {
+  rescale_at_ = 2 * index_->size();
+  ++generation_;
+  std::vector<IndexedView> views;
+  for (IndexedView& view : views_)
+    if (view.live) views.push_back(std::move(view));
+
+  const Eigen::Index dimensions = weights_.size();
+  Eigen::VectorXd sum = Eigen::VectorXd::Zero(dimensions), squares = sum;
+  for (const IndexedView& view : views) {
+    sum += view.descriptor.cast<double>();
+    squares += view.descriptor.cast<double>().cwiseAbs2();
+  }
+  const double n = static_cast<double>(views.size());
+  const Eigen::VectorXd variance = squares / n - (sum / n).cwiseAbs2();
+  constexpr double kLeastDeviation = 1e-3;  // a dimension that never varies tells nothing, whatever its rounding errors
+  for (Eigen::Index i = 0; i < dimensions; ++i)
+    weights_[i] = static_cast<float>(variance[i] > kLeastDeviation * kLeastDeviation ? 1.0 / std::sqrt(variance[i]) : 0.0);
+
+  index_.emplace(static_cast<std::size_t>(dimensions));
+  views_.clear();
+  items_.clear();
+  for (IndexedView& view : views) Insert(std::move(view));
+}
+
+}  // namespace incremental_segmatch
