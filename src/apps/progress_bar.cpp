@@ -6,7 +6,7 @@
 #include <cstdio>
 #include <utility>
 
-namespace incremental_segmatch {
+namespace incremental_segmatch::apps {
 namespace {
 
 using std::chrono::milliseconds;
@@ -29,7 +29,10 @@ std::string FormatDuration(double seconds) {
 }  // namespace
 
 ProgressBar::ProgressBar(std::string label, std::size_t total)
-    : label_(std::move(label)), total_(total), is_terminal_(isatty(STDERR_FILENO) == 1), next_draw_(start_ + kFirstDraw) {}
+    : label_(std::move(label)),
+      total_(total),
+      is_terminal_(isatty(STDERR_FILENO) == 1),
+      next_draw_(start_ + kFirstDraw) {}
 
 ProgressBar::~ProgressBar() {
   if (!drawn_) return;
@@ -56,7 +59,8 @@ void ProgressBar::Draw(double elapsed_s) {
   const std::string left = done_ > 0 ? FormatDuration(elapsed_s / share * (1.0 - share)) + " left" : "starting";
   const double per_second = elapsed_s > 0.0 ? static_cast<double>(done_) / elapsed_s : 0.0;
   if (!is_terminal_) {
-    std::fprintf(stderr, "%s: %zu of %zu, %.1f a second, %s\n", label_.c_str(), done_, total_, per_second, left.c_str());
+    std::fprintf(stderr, "%s: %zu of %zu, %.1f a second, %s\n", label_.c_str(), done_, total_, per_second,
+                 left.c_str());
     return;
   }
   const int filled = static_cast<int>(share * kBarWidth);
@@ -65,4 +69,4 @@ void ProgressBar::Draw(double elapsed_s) {
   std::fflush(stderr);
 }
 
-}  // namespace incremental_segmatch
+}  // namespace incremental_segmatch::apps

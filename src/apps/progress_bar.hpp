@@ -6,7 +6,7 @@
 #include <cstddef>
 #include <string>
 
-namespace incremental_segmatch {
+namespace incremental_segmatch::apps {
 
 /// Shows share done and remaining time on standard error: one line that is redrawn on a terminal, a line now and then
 /// elsewhere. Nothing is shown of work that is over within a second.
@@ -38,4 +38,4 @@ class ProgressBar {
   Clock::time_point next_draw_;
 };
 
-}  // namespace incremental_segmatch
+}  // namespace incremental_segmatch::apps

@@ -1,0 +1,190 @@
+#include "evaluation/evaluation.hpp"
+
+#include <algorithm>
+#include <chrono>
+
+#include "incremental_segmatch/back_end.hpp"
+#include "incremental_segmatch/front_end.hpp"
+
+namespace incremental_segmatch {
+namespace {
+
+constexpr RobotIndex kRobot = 0;
+
+class Stopwatch {
+ public:
+  double Milliseconds() const {
+    return std::chrono::duration<double, std::milli>(std::chrono::steady_clock::now() - start_).count();
+  }
+
+ private:
+  std::chrono::steady_clock::time_point start_ = std::chrono::steady_clock::now();
+};
+
+ClosureRow ToRow(const LoopClosure& closure) {
+  return {closure.stamp_query_ns, closure.stamp_target_ns, closure.robot_query, closure.robot_target,
+          closure.T_target_query, closure.inliers,         closure.candidates,  closure.rms_m};
+}
+
+// Step of the drive at a stamp that the back end gave back.
+std::size_t StepAt(const std::vector<StampedPose>& odometry, StampNs stamp_ns) {
+  const auto it = std::lower_bound(odometry.begin(), odometry.end(), stamp_ns,
+                                   [](const StampedPose& pose, StampNs stamp) { return pose.stamp_ns < stamp; });
+  return static_cast<std::size_t>(it - odometry.begin());
+}
+
+// Feeds the pose graph and the corrections that come of it; knows when it is time for either.
+class LoopCloser {
+ public:
+  explicit LoopCloser(const EvaluationParameters& parameters)
+      : parameters_(parameters), graph_(parameters.pose_graph) {}
+
+  void AddPose(const StampedPose& odometry) {
+    if (started_) travelled_m_ += (odometry.T_frame_sensor.translation() - last_position_).norm();
+    started_ = true;
+    last_position_ = odometry.T_frame_sensor.translation();
+    graph_.AddNode(kRobot, odometry.stamp_ns, odometry.T_frame_sensor);
+  }
+
+  // True if the closure entered the graph.
+  bool AddClosure(const LoopClosure& closure) {
+    if (travelled_m_ - last_closure_m_ < parameters_.closure_spacing_m) return false;
+    if (!graph_.AddClosure(kRobot, closure.stamp_target_ns, kRobot, closure.stamp_query_ns, closure.T_target_query,
+                           closure.covariance)) {
+      return false;
+    }
+    last_closure_m_ = travelled_m_;
+    has_new_closure_ = true;
+    return true;
+  }
+
+  // Optimizes and corrects the back end's map if it is time to. True if it did.
+  bool CorrectIfDue(BackEnd& back_end) {
+    if (!has_new_closure_ || travelled_m_ - last_optimization_m_ < parameters_.optimization_spacing_m) return false;
+    Optimize();
+    back_end.CorrectTrajectory(parameters_.robot, graph_.Trajectory(kRobot));
+    return true;
+  }
+
+  void Optimize() {
+    report_ = graph_.Optimize();
+    last_optimization_m_ = travelled_m_;
+    has_new_closure_ = false;
+  }
+
+  const PoseGraphReport& report() const { return report_; }
+  std::vector<StampedPose> Trajectory() const { return graph_.Trajectory(kRobot); }
+  PoseGraph TakeGraph() { return std::move(graph_); }
+
+ private:
+  static constexpr double kLongAgo = -std::numeric_limits<double>::infinity();
+
+  const EvaluationParameters& parameters_;
+  PoseGraph graph_;
+  PoseGraphReport report_;
+  bool started_ = false;
+  bool has_new_closure_ = false;
+  Eigen::Vector3d last_position_ = Eigen::Vector3d::Zero();
+  double travelled_m_ = 0.0;
+  double last_closure_m_ = kLongAgo;
+  double last_optimization_m_ = kLongAgo;
+};
+
+// Truth of the first `steps` scans; nothing if any of them has none.
+std::optional<std::vector<Pose>> ReadTruth(const DriveSource& drive, std::size_t steps) {
+  std::vector<Pose> truth;
+  for (std::size_t i = 0; i < steps; ++i) {
+    const std::optional<Pose> pose = drive.T_world_sensor(i);
+    if (!pose) return std::nullopt;
+    truth.push_back(*pose);
+  }
+  return truth;
+}
+
+TrajectoryErrors MeasureErrors(const EvaluationResult& result, const std::vector<StampNs>& stamps_ns,
+                               const std::vector<Pose>& truth, const PoseGraphParameters& parameters) {
+  const std::vector<Pose> odometry = PosesOf(result.odometry);
+  const auto bound = [&](const std::vector<GraphClosure>& closures) {
+    return AbsoluteTrajectoryError(PosesOf(OptimizeWithTrueClosures(stamps_ns, odometry, truth, closures, parameters)),
+                                   truth);
+  };
+  std::vector<GraphClosure> every_revisit;
+  for (std::size_t i = 0; i < truth.size(); ++i) {
+    const std::optional<std::size_t> target = result.score->revisit_targets[i];
+    if (target) every_revisit.push_back({*target, i, Covariance6::Zero()});
+  }
+  TrajectoryErrors errors;
+  errors.odometry_m = AbsoluteTrajectoryError(odometry, truth);
+  errors.optimized_m = AbsoluteTrajectoryError(PosesOf(result.optimized), truth);
+  errors.bound_same_places_m = bound(result.graph_closures);
+  errors.bound_every_revisit_m = bound(every_revisit);
+  return errors;
+}
+
+}  // namespace
+
+EvaluationResult Evaluate(DriveSource& drive, const EvaluationParameters& parameters,
+                          const std::function<void(std::size_t, std::size_t)>& progress) {
+  const Stopwatch run;
+  const std::size_t steps = std::min(drive.size(), parameters.max_steps);
+  FrontEnd front_end(parameters.core.front_end, parameters.robot);
+  BackEnd back_end(parameters.core.back_end);
+  LoopCloser closer(parameters);
+  EvaluationResult result;
+  result.drive = drive.name();
+  result.notes = drive.notes();
+  result.odometry_is_truth = drive.odometry_is_truth();
+  std::vector<StampNs> stamps_ns;
+
+  for (std::size_t i = 0; i < steps; ++i) {
+    StepRecord record;
+    const Stopwatch reading;
+    const Scan scan{drive.stamp_ns(i), drive.ReadPoints(i), drive.T_odom_sensor(i)};
+    record.read_ms = reading.Milliseconds();
+    record.stamp_ns = scan.stamp_ns;
+
+    const Stopwatch step;
+    FrontEndStep seen = front_end.Process(scan);
+    BackEndStep recognized = back_end.Process(seen.delta);
+    record.total_ms = step.Milliseconds();
+
+    record.stages = std::move(seen.times);
+    record.stages.insert(record.stages.end(), recognized.times.begin(), recognized.times.end());
+    record.front_end = seen.counts;
+    record.back_end = recognized.counts;
+    stamps_ns.push_back(scan.stamp_ns);
+    result.odometry.push_back({scan.stamp_ns, scan.T_odom_sensor});
+    if (recognized.closure) result.closures.push_back(ToRow(*recognized.closure));
+
+    if (parameters.optimize) {
+      closer.AddPose(result.odometry.back());
+      const Stopwatch optimization;
+      if (recognized.closure && closer.AddClosure(*recognized.closure)) {
+        result.graph_closures.push_back(
+            {StepAt(result.odometry, recognized.closure->stamp_target_ns), i, recognized.closure->covariance});
+      }
+      if (closer.CorrectIfDue(back_end)) record.optimize_ms = optimization.Milliseconds();
+    }
+    result.steps.push_back(std::move(record));
+    if (progress) progress(i + 1, steps);
+  }
+
+  result.optimized = result.odometry;
+  if (parameters.optimize && steps > 0) {
+    closer.Optimize();
+    result.last_optimization = closer.report();
+    result.optimized = closer.Trajectory();
+    result.pose_graph = closer.TakeGraph();
+  }
+  const std::optional<std::vector<Pose>> truth = ReadTruth(drive, steps);
+  if (truth && steps > 0) {
+    result.score = ScoreClosures(stamps_ns, *truth, result.closures, parameters.scoring);
+    if (parameters.optimize) {
+      result.trajectory_error = MeasureErrors(result, stamps_ns, *truth, parameters.pose_graph);
+    }
+  }
+  result.seconds = run.Milliseconds() / 1000.0;
+  return result;
+}
+
+}  // namespace incremental_segmatch
