@@ -1,10 +1,10 @@
 #include "apps/simulate.hpp"
 
-#include <chrono>
 #include <cstdio>
 #include <memory>
 #include <string>
 
+#include "apps/progress_bar.hpp"
 #include "simulator/kitti_writer.hpp"
 #include "simulator/simulation.hpp"
 
@@ -18,37 +18,16 @@ struct SimulateArguments {
   std::string sequence = "00";
 };
 
-// One line on stderr that is rewritten: bar, scans a second and remaining time.
-class Progress {
- public:
-  explicit Progress(std::size_t total) : total_(total) {}
-
-  void operator()(std::size_t done) {
-    const auto now = std::chrono::steady_clock::now();
-    if (done < total_ && now - shown_ < std::chrono::milliseconds(250)) return;
-    shown_ = now;
-    const double elapsed_s = std::chrono::duration<double>(now - begin_).count();
-    const double left_s = elapsed_s * static_cast<double>(total_ - done) / static_cast<double>(done);
-    constexpr std::size_t kWidth = 30;
-    const std::string bar(kWidth * done / total_, '#');
-    std::fprintf(stderr, "\r[%-30s] %zu/%zu scans, %.1f/s, %d:%02d left ", bar.c_str(), done, total_,
-                 static_cast<double>(done) / elapsed_s, static_cast<int>(left_s) / 60, static_cast<int>(left_s) % 60);
-    if (done == total_) std::fputc('\n', stderr);
-  }
-
- private:
-  std::size_t total_;
-  std::chrono::steady_clock::time_point begin_ = std::chrono::steady_clock::now();
-  std::chrono::steady_clock::time_point shown_{};
-};
-
 void Simulate(SimulateArguments arguments) {
   simulator::SimulationOptions& options = arguments.options;
   options.drift.translation_percent = arguments.drift_percent;
   options.drift.rotation_deg_per_100m = arguments.drift_percent * 0.8 / 0.7;
   simulator::Simulation simulation(options);
-  Progress progress(simulation.size());
-  simulator::WriteKitti(simulation, arguments.out, arguments.sequence, progress);
+  {
+    ProgressBar progress("Simulating", simulation.size());
+    simulator::WriteKitti(simulation, arguments.out, arguments.sequence,
+                          [&progress](std::size_t done) { progress.Update(done); });
+  }
   std::printf("%zu scans in %s/sequences/%s, truth in %s/poses/%s.txt\n", simulation.size(), arguments.out.c_str(),
               arguments.sequence.c_str(), arguments.out.c_str(), arguments.sequence.c_str());
 }
@@ -63,7 +42,7 @@ void AddSimulateCommand(CLI::App& app) {
       "Drive a simulated LiDAR through a town made up on the fly and write the drive in KITTI's odometry layout:\n"
       "ROOT/sequences/SS/{velodyne/NNNNNN.bin,calib.txt,times.txt,odometry.txt} and ROOT/poses/SS.txt.\n"
       "The poses are the truth; odometry.txt drifts as a LiDAR odometry does. The same options give the same bytes.\n\n"
-      "  segmatch simulate --out data                        about 1.4 km with loops, HDL-64E\n"
+      "  segmatch simulate --out data                        about 1.6 km with loops, HDL-64E\n"
       "  segmatch simulate --out data --poses kitti/05.txt   along the shape of a real drive\n"
       "  segmatch simulate --out data --day 1 --sequence 01  the same streets on another day\n");
   command->add_option("--out", arguments->out, "folder to write into (ROOT)")->required();

@@ -177,10 +177,11 @@ Primitives BuildPicketFence(const Item& item) {
 Primitives BuildTree(const Item& item) {
   Random random(item.seed);
   Primitives out;
-  const float height = static_cast<float>(item.height_m);
+  const float height = static_cast<float>(std::max(item.height_m, item.lowest_leaf_m + 2.0));
   const float radius = static_cast<float>(item.footprint.half_m.x());
-  const bool conifer = random.Chance(0.15);
-  const float crown_base = conifer ? random.UniformF(0.3, 1.2) : std::min(0.55f * height, random.UniformF(1.2, 3.2));
+  const bool conifer = random.Chance(0.15) && item.lowest_leaf_m == 0.0;
+  const float natural_base = conifer ? random.UniformF(0.3, 1.2) : std::min(0.55f * height, random.UniformF(1.2, 3.2));
+  const float crown_base = std::max(natural_base, static_cast<float>(item.lowest_leaf_m));
   const float lean_x = random.UniformF(-0.15, 0.15), lean_y = random.UniformF(-0.15, 0.15);
   const Vector3f fork(lean_x, lean_y, crown_base + 0.25f * (height - crown_base));
   out.push_back(Primitive::Cylinder({0, 0, -0.5f}, fork, radius, Material::kBark));

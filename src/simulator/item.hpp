@@ -38,6 +38,7 @@ struct Item {
   Footprint footprint;
   double height_m = 1.0;
   std::uint64_t seed = 0;
+  double lowest_leaf_m = 0.0;  ///< crowns begin at least this high: street trees are pruned
 };
 
 /// Geometry of an item in its own frame; a deterministic function of its argument. Parking spots have none of their

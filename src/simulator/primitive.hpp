@@ -20,7 +20,6 @@ enum class Shape : std::uint8_t {
 
 enum class Material : std::uint8_t {
   kRoad,
-  kGrass,
   kPlaster,
   kBrick,
   kWood,

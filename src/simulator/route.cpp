@@ -109,8 +109,8 @@ using Corners = std::vector<Eigen::Vector2d>;
 
 // Nodes of a street grid, 3 by 2 blocks of unequal size.
 Eigen::Vector2d Node(int column, int row) {
-  static constexpr double kX[] = {0.0, 92.0, 168.0, 252.0};
-  static constexpr double kY[] = {0.0, 64.0, 124.0};
+  static constexpr double kX[] = {0.0, 106.0, 182.0, 266.0};
+  static constexpr double kY[] = {0.0, 76.0, 136.0};
   return {kX[column], kY[row]};
 }
 

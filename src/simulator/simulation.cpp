@@ -63,8 +63,6 @@ float Reflectivity(Material material) {
   switch (material) {
     case Material::kRoad:
       return 0.22f;
-    case Material::kGrass:
-      return 0.4f;
     case Material::kPlaster:
       return 0.5f;
     case Material::kBrick:

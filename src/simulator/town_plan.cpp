@@ -179,7 +179,7 @@ class Planner {
   }
 
   Item Make(ItemKind kind, const Footprint& footprint, double height_m) {
-    return {kind, footprint, height_m, random_.Bits()};
+    return {kind, footprint, height_m, random_.Bits(), 0.0};
   }
 
   Footprint Turned(Footprint footprint, double by_rad) {
@@ -342,10 +342,18 @@ class Planner {
     }
   }
 
+  // Trees whose crowns reach over the street are pruned.
+  double LowestLeaf(const Footprint& at) const {
+    static constexpr double kReach_m = 7.0, kPruned_m = 3.4;
+    return trajectory_.Distance(at, kReach_m) < kReach_m ? kPruned_m : 0.0;
+  }
+
   void AddTree(Footprint at, double margin) {
     const double radius = random_.Uniform(0.07, 0.32);
     at.half_m = {radius, radius};
-    plot_.Add(Make(ItemKind::kTree, at, 3.0 + 22.0 * radius + random_.Uniform(0.0, 3.0)), margin);
+    Item tree = Make(ItemKind::kTree, at, 3.0 + 22.0 * radius + random_.Uniform(0.0, 3.0));
+    tree.lowest_leaf_m = LowestLeaf(at);
+    plot_.Add(tree, margin);
   }
 
   void AddBush(Footprint at) {
@@ -408,7 +416,7 @@ class Planner {
   // Everything equal at equal distances: the seed of each kind is one and the same.
   void LookAlikeSide(const StreetSide& side) {
     const auto add = [&](ItemKind kind, const Footprint& footprint, double height, double margin, std::uint64_t make) {
-      plot_.Add({kind, footprint, height, HashOf(parameters_.seed, make)}, margin);
+      plot_.Add({kind, footprint, height, HashOf(parameters_.seed, make), LowestLeaf(footprint)}, margin);
     };
     for (double along = 12.0; along < side.length_m(); along += 16.0) {
       add(ItemKind::kHouse, side.At(along, side.profile().boundary_m + 9.5, {6.0, 5.5}), 5.5, 1.0, 1);
