@@ -361,16 +361,6 @@ std::uint32_t DynamicVoxelGrid::PointCount(VoxelHandle voxel) const {
   return block(voxel / kCellsPerBlock).voxels[voxel % kCellsPerBlock].count;
 }
 
-Eigen::Vector3d DynamicVoxelGrid::BlockCorner(VoxelHandle voxel) const {
-  const std::array<std::int32_t, 3>& c = block(voxel / kCellsPerBlock).coordinates;
-  const double side = kBlockSide * parameters_.resolution_m;
-  return {c[0] * side + parameters_.center_m[0], c[1] * side + parameters_.center_m[1], c[2] * side + parameters_.center_m[2]};
-}
-
-const Eigen::Vector3f& DynamicVoxelGrid::CentroidInBlock(VoxelHandle voxel) const {
-  return block(voxel / kCellsPerBlock).voxels[voxel % kCellsPerBlock].centroid_block;
-}
-
 std::vector<VoxelHandle> DynamicVoxelGrid::ActiveVoxels() const {
   std::vector<VoxelHandle> voxels;
   voxels.reserve(active_voxels_);

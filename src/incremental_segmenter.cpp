@@ -41,6 +41,8 @@ SegmentUpdate IncrementalSegmenter<Policy>::Remove(const std::vector<RemovedVoxe
     } else if (cluster.live_voxels == 0) {
       MarkDirty(&cluster);
     }
+    BlockNode& block = blocks_[gone.voxel / DynamicVoxelGrid::kCellsPerBlock];
+    if (--block.clustered == 0) SetBlockLabel(&block, kNoLabel);
     Release(node.label);
     node = VoxelNode();
   }
@@ -49,7 +51,10 @@ SegmentUpdate IncrementalSegmenter<Policy>::Remove(const std::vector<RemovedVoxe
 
 template <class Policy>
 SegmentUpdate IncrementalSegmenter<Policy>::Insert(const VoxelUpdate& update) {
-  if (voxels_.size() < grid_->handle_capacity()) voxels_.resize(grid_->handle_capacity());
+  if (voxels_.size() < grid_->handle_capacity()) {
+    voxels_.resize(grid_->handle_capacity());
+    blocks_.resize(voxels_.size() / DynamicVoxelGrid::kCellsPerBlock);
+  }
   for (const MovedVoxel& moved : update.moved) {
     if (!IsClustered(moved.voxel)) continue;
     Cluster& cluster = ClusterAt(FindRoot(voxels_[moved.voxel].label));
@@ -58,6 +63,8 @@ SegmentUpdate IncrementalSegmenter<Policy>::Insert(const VoxelUpdate& update) {
     cluster.grew = true;
     MarkDirty(&cluster);
   }
+  for (const VoxelHandle voxel : update.activated)
+    blocks_[voxel / DynamicVoxelGrid::kCellsPerBlock].pending |= std::uint64_t{1} << (voxel % DynamicVoxelGrid::kCellsPerBlock);
   seeds_ = update.activated;
   policy_.PrepareSeeds(&seeds_);
   for (const VoxelHandle seed : seeds_)
@@ -70,27 +77,79 @@ template <class Policy>
 void IncrementalSegmenter<Policy>::GrowFromSeed(VoxelHandle seed) {
   Label root = kNoLabel;
   region_.clear();
-  queue_.assign(1, seed);
-  voxels_[seed].label = kQueued;
+  Queue(seed);
   while (!queue_.empty()) {
     const VoxelHandle from = queue_.back();
     queue_.pop_back();
     region_.push_back(from);
-    grid_->ForEachNeighbour(stencil_, from, [&](VoxelHandle to, const Eigen::Vector3f&) {
-      const Label label = voxels_[to].label;
-      if (label == kQueued || !policy_.CanPointBeSeed(to) || !policy_.CanGrowToPoint(from, to)) return true;
-      if (label == kNoLabel) {
-        voxels_[to].label = kQueued;
-        queue_.push_back(to);
-      } else if (label != root) {
-        const Label met = FindRoot(label);
-        root = root == kNoLabel ? met : Link(root, met);
-      }
-      return true;
-    });
+    if constexpr (Policy::kAcceptsAll) {
+      root = VisitNeighbourBlocks(from, root);
+    } else {
+      root = VisitNeighbours(from, root);
+    }
   }
   if (root == kNoLabel) root = NewCluster();
   for (const VoxelHandle voxel : region_) AddVoxel(root, voxel);
+}
+
+template <class Policy>
+void IncrementalSegmenter<Policy>::Queue(VoxelHandle voxel) {
+  voxels_[voxel].label = kQueued;
+  blocks_[voxel / DynamicVoxelGrid::kCellsPerBlock].pending &=
+      ~(std::uint64_t{1} << (voxel % DynamicVoxelGrid::kCellsPerBlock));
+  queue_.push_back(voxel);
+}
+
+/// The region with this root (kNoLabel: none yet) meets a cluster; returns the root of what they become.
+template <class Policy>
+typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::Meet(Label root, Label other) {
+  return root == kNoLabel ? FindRoot(other) : Link(root, FindRoot(other));
+}
+
+template <class Policy>
+typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::VisitNeighbours(VoxelHandle from, Label root) {
+  grid_->ForEachNeighbour(stencil_, from, [&](VoxelHandle to, const Eigen::Vector3f&) {
+    const Label label = voxels_[to].label;
+    if (label == kQueued || !policy_.CanPointBeSeed(to) || !policy_.CanGrowToPoint(from, to)) return true;
+    if (label == kNoLabel) {
+      Queue(to);
+    } else if (label != root) {
+      root = Meet(root, label);
+    }
+    return true;
+  });
+  return root;
+}
+
+/// The same where every neighbour counts: of a block whose voxels are all of one cluster, one within the radius decides, and
+/// none need be looked at if the region met that cluster before.
+template <class Policy>
+typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::VisitNeighbourBlocks(VoxelHandle from, Label root) {
+  const float radius2 = static_cast<float>(stencil_.radius_m() * stencil_.radius_m());
+  grid_->ForEachNeighbourBlock(stencil_, from, [&](std::uint32_t slot, std::uint64_t cells, const Eigen::Vector3f& shift) {
+    BlockNode& block = blocks_[slot];
+    const VoxelHandle first = slot * DynamicVoxelGrid::kCellsPerBlock;
+    const auto handle = [&](std::uint64_t bits) { return first + static_cast<VoxelHandle>(__builtin_ctzll(bits)); };
+    const auto is_near = [&](VoxelHandle to) { return (grid_->CentroidInBlock(to) + shift).squaredNorm() <= radius2; };
+    for (std::uint64_t pending = cells & block.pending; pending != 0; pending &= pending - 1) {
+      cells &= ~(pending & -pending);
+      if (is_near(handle(pending))) Queue(handle(pending));
+    }
+    if (block.label == kNoLabel) return true;
+    if (block.label != kMixed) {
+      SetBlockLabel(&block, FindRoot(block.label));
+      if (block.label == root) return true;
+    }
+    for (; cells != 0; cells &= cells - 1) {
+      const VoxelHandle to = handle(cells);
+      const Label label = voxels_[to].label;
+      if (label == root || label == kQueued || !is_near(to)) continue;
+      root = Meet(root, label);
+      if (block.label != kMixed) break;
+    }
+    return true;
+  });
+  return root;
 }
 
 template <class Policy>
@@ -113,6 +172,15 @@ void IncrementalSegmenter<Policy>::Release(Label label) const {
     free_nodes_.push_back(label);
     label = nodes_[label].parent;
   }
+}
+
+template <class Policy>
+void IncrementalSegmenter<Policy>::SetBlockLabel(BlockNode* block, Label label) {
+  const Label old = block->label;
+  if (old == label) return;
+  if (label < kMixed) ++nodes_[label].references;
+  block->label = label;
+  if (old < kMixed) Release(old);
 }
 
 template <class Policy>
@@ -146,6 +214,12 @@ void IncrementalSegmenter<Policy>::AddVoxel(Label root, VoxelHandle voxel) {
   VoxelNode& node = voxels_[voxel];
   node.label = root;
   ++nodes_[root].references;
+  BlockNode& block = blocks_[voxel / DynamicVoxelGrid::kCellsPerBlock];
+  if (block.clustered++ == 0) {
+    SetBlockLabel(&block, root);
+  } else if (block.label != kMixed && FindRoot(block.label) != root) {
+    SetBlockLabel(&block, kMixed);
+  }
   if (cluster.first == kEnd) {
     node.previous = node.next = voxel;
   } else {
@@ -350,6 +424,7 @@ template <class Policy>
 std::size_t IncrementalSegmenter<Policy>::memory_bytes() const {
   return nodes_.capacity() * sizeof(Node) + free_nodes_.capacity() * sizeof(Label) + clusters_.capacity() * sizeof(Cluster) +
          free_clusters_.capacity() * sizeof(ClusterIndex) + voxels_.capacity() * sizeof(VoxelNode) +
+         blocks_.capacity() * sizeof(BlockNode) +
          (seeds_.capacity() + queue_.capacity() + region_.capacity()) * sizeof(VoxelHandle);
 }
 

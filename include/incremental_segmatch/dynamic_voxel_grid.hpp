@@ -105,9 +105,16 @@ class DynamicVoxelGrid {
   bool IsActive(VoxelHandle voxel) const;
   std::uint32_t PointCount(VoxelHandle voxel) const;
   /// Lower corner of the block that the voxel belongs to, in the grid's frame (exact multiples of 4 cells).
-  Eigen::Vector3d BlockCorner(VoxelHandle voxel) const;
+  Eigen::Vector3d BlockCorner(VoxelHandle voxel) const {
+    const std::array<std::int32_t, 3>& c = block(voxel / kCellsPerBlock).coordinates;
+    const double side_m = kBlockSide * parameters_.resolution_m;
+    return {c[0] * side_m + parameters_.center_m[0], c[1] * side_m + parameters_.center_m[1],
+            c[2] * side_m + parameters_.center_m[2]};
+  }
   /// Centroid relative to BlockCorner.
-  const Eigen::Vector3f& CentroidInBlock(VoxelHandle voxel) const;
+  const Eigen::Vector3f& CentroidInBlock(VoxelHandle voxel) const {
+    return block(voxel / kCellsPerBlock).voxels[voxel % kCellsPerBlock].centroid_block;
+  }
   /// Centroid in the grid's frame.
   Eigen::Vector3d CentroidGrid(VoxelHandle voxel) const { return BlockCorner(voxel) + CentroidInBlock(voxel).cast<double>(); }
   Eigen::Vector3d CentroidOdom(VoxelHandle voxel) const { return T_odom_grid_ * CentroidGrid(voxel); }
@@ -119,6 +126,12 @@ class DynamicVoxelGrid {
   /// stencil's radius; difference = centroid of the neighbour minus this voxel's. visit returns false to stop.
   template <class Visit>
   void ForEachNeighbour(const NeighbourStencil& stencil, VoxelHandle voxel, Visit&& visit) const;
+
+  /// The same a block at a time, for consumers that can settle many voxels at once: calls visit(slot, cells, shift) for each
+  /// block that may hold neighbours. Handles are slot * kCellsPerBlock + cell for the set bits of cells (active voxels, this one
+  /// included); CentroidInBlock(handle) + shift is the difference to this voxel's centroid, still to be held against the radius.
+  template <class Visit>
+  void ForEachNeighbourBlock(const NeighbourStencil& stencil, VoxelHandle voxel, Visit&& visit) const;
 
  private:
   static constexpr std::uint32_t kNoBlock = 0xffffffffu;
@@ -167,27 +180,35 @@ class DynamicVoxelGrid {
 };
 
 template <class Visit>
-void DynamicVoxelGrid::ForEachNeighbour(const NeighbourStencil& stencil, VoxelHandle voxel, Visit&& visit) const {
+void DynamicVoxelGrid::ForEachNeighbourBlock(const NeighbourStencil& stencil, VoxelHandle voxel, Visit&& visit) const {
   const Block& home = block(voxel / kCellsPerBlock);
   const unsigned cell = voxel % kCellsPerBlock;
   const Eigen::Vector3f center = home.voxels[cell].centroid_block;
-  const float radius2 = static_cast<float>(stencil.radius_m() * stencil.radius_m());
   for (const NeighbourStencil::BlockVisit& at : stencil.visits(cell)) {
     const std::uint32_t slot =
         at.link >= 0 ? home.links[at.link]
                      : FindBlock({home.coordinates[0] + at.offset[0], home.coordinates[1] + at.offset[1],
                                   home.coordinates[2] + at.offset[2]});
     if (slot == kNoBlock) continue;
-    const Block& other = block(slot);
+    const std::uint64_t cells = block(slot).active & at.cells;
+    if (cells == 0) continue;
     const Eigen::Vector3f shift(at.offset[0] * block_size_m_ - center.x(), at.offset[1] * block_size_m_ - center.y(),
                                 at.offset[2] * block_size_m_ - center.z());
-    for (std::uint64_t cells = other.active & at.cells; cells != 0; cells &= cells - 1) {
-      const unsigned neighbour_cell = static_cast<unsigned>(__builtin_ctzll(cells));
-      const Eigen::Vector3f difference = other.voxels[neighbour_cell].centroid_block + shift;
-      const VoxelHandle neighbour = slot * kCellsPerBlock + neighbour_cell;
-      if (difference.squaredNorm() <= radius2 && neighbour != voxel && !visit(neighbour, difference)) return;
-    }
+    if (!visit(slot, cells, shift)) return;
   }
+}
+
+template <class Visit>
+void DynamicVoxelGrid::ForEachNeighbour(const NeighbourStencil& stencil, VoxelHandle voxel, Visit&& visit) const {
+  const float radius2 = static_cast<float>(stencil.radius_m() * stencil.radius_m());
+  ForEachNeighbourBlock(stencil, voxel, [&](std::uint32_t slot, std::uint64_t cells, const Eigen::Vector3f& shift) {
+    for (; cells != 0; cells &= cells - 1) {
+      const VoxelHandle neighbour = slot * kCellsPerBlock + static_cast<VoxelHandle>(__builtin_ctzll(cells));
+      const Eigen::Vector3f difference = CentroidInBlock(neighbour) + shift;
+      if (difference.squaredNorm() <= radius2 && neighbour != voxel && !visit(neighbour, difference)) return false;
+    }
+    return true;
+  });
 }
 
 }  // namespace incremental_segmatch

@@ -98,6 +98,7 @@ class IncrementalSegmenter {
   using ClusterIndex = std::uint32_t;
   static constexpr Label kNoLabel = 0xffffffffu;   // not clustered yet
   static constexpr Label kQueued = 0xfffffffeu;    // in the region that grows now
+  static constexpr Label kMixed = 0xfffffffdu;     // of a block with voxels of several clusters
   static constexpr VoxelHandle kEnd = 0xffffffffu;
 
   enum class State : std::uint8_t { kFree, kSmall, kSegment, kTooLarge, kCut };
@@ -105,7 +106,7 @@ class IncrementalSegmenter {
   // A label: node of the union-find forest.
   struct Node {
     Label parent = kNoLabel;       // itself at roots
-    std::uint32_t references = 0;  // voxels that carry the label, and nodes that point to it
+    std::uint32_t references = 0;  // voxels and blocks that carry the label, and nodes that point to it
     ClusterIndex cluster = 0;      // at roots
   };
   struct Cluster {
@@ -118,6 +119,12 @@ class IncrementalSegmenter {
     VoxelHandle first = kEnd;         // of its circular, doubly linked list of voxels
     SegmentMoments moments;
     std::vector<SegmentId> absorbed;  // IDs of segments that merged into it in this call
+  };
+  // What is known of a block of the grid, so that its voxels need not be looked at one by one.
+  struct BlockNode {
+    std::uint64_t pending = 0;  // cells that are active and not clustered or queued yet
+    Label label = kNoLabel;     // of the one cluster that all its clustered voxels belong to; or kMixed
+    std::uint32_t clustered = 0;
   };
   struct VoxelNode {
     Label label = kNoLabel;
@@ -136,6 +143,11 @@ class IncrementalSegmenter {
   Cluster& ClusterAt(Label root) { return clusters_[nodes_[root].cluster]; }
   Label NewCluster();
   void GrowFromSeed(VoxelHandle seed);
+  void Queue(VoxelHandle voxel);
+  Label Meet(Label root, Label other);
+  void SetBlockLabel(BlockNode* block, Label label);
+  Label VisitNeighbours(VoxelHandle from, Label root);
+  Label VisitNeighbourBlocks(VoxelHandle from, Label root);
   void AddVoxel(Label root, VoxelHandle voxel);
   Label Link(Label a, Label b);
   void MarkDirty(Cluster* cluster);
@@ -155,7 +167,8 @@ class IncrementalSegmenter {
   mutable std::vector<Label> free_nodes_;
   std::vector<Cluster> clusters_;
   std::vector<ClusterIndex> free_clusters_;
-  std::vector<VoxelNode> voxels_;
+  std::vector<VoxelNode> voxels_;            // by handle
+  std::vector<BlockNode> blocks_;            // by handle / DynamicVoxelGrid::kCellsPerBlock
   std::vector<ClusterIndex> dirty_;
   std::vector<std::pair<SegmentId, ClusterIndex>> tracked_;  // ascending IDs
   std::vector<VoxelHandle> seeds_, queue_, region_;          // work space
