@@ -4,40 +4,93 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <limits>
 #include <memory>
+#include <utility>
 #include <vector>
 
 #include "incremental_segmatch/correspondence.hpp"
 
 namespace incremental_segmatch {
 
-/// Undirected graph over correspondences 0..n-1; neighbours are sorted by index, no self loops.
+/// Undirected graph over correspondences 0..n-1 in compressed rows: the neighbours of v are
+/// `neighbours[offsets[v] .. offsets[v + 1])`, sorted by index, no self loops, every edge in both rows.
 struct ConsistencyGraph {
-  std::vector<std::vector<std::uint32_t>> neighbours;
-  std::uint64_t tested_pairs = 0;  ///< how many pairs were tested for consistency
+  /// The neighbours of one vertex.
+  struct Range {
+    const std::uint32_t* first = nullptr;
+    const std::uint32_t* last = nullptr;
+    const std::uint32_t* begin() const { return first; }
+    const std::uint32_t* end() const { return last; }
+    std::size_t size() const { return static_cast<std::size_t>(last - first); }
+  };
+  using Edge = std::pair<std::uint32_t, std::uint32_t>;
+
+  std::vector<std::size_t> offsets{0};    ///< vertices() + 1 entries
+  std::vector<std::uint32_t> neighbours;  ///< 2 * edges entries
+  std::uint64_t tested_pairs = 0;         ///< how many pairs were tested for consistency
   std::size_t edges = 0;
+
+  std::size_t vertices() const { return offsets.size() - 1; }
+  Range Neighbours(std::uint32_t vertex) const {
+    return {neighbours.data() + offsets[vertex], neighbours.data() + offsets[vertex + 1]};
+  }
+  /// O(log degree).
+  bool HasEdge(std::uint32_t a, std::uint32_t b) const;
+
+  /// The graph with these edges, each given once, in any order and direction. O(vertices + edges).
+  static ConsistencyGraph FromEdges(std::size_t vertices, const std::vector<Edge>& edges);
 };
 
-enum class ConsistencyMethod { kAllPairs, kPartitioned2D, kPartitioned3D, kCached, kAuto };
+/// How the pairs to be tested are found. Every method returns the same edges.
+enum class ConsistencyMethod {
+  kAllPairs,       ///< every pair, O(n^2)
+  kPartitioned2D,  ///< squares over the target centroids (3.14 to 3.17); linear in n at constant density
+  kPartitioned3D,  ///< cubes over the target centroids; pays where targets lie above each other (storeys)
+  kCached,         ///< candidates are remembered between calls (3.18, 3.19)
+  kAuto            ///< whichever of the others measured fastest in the last calls
+};
 
 struct ConsistencyParameters {
-  double epsilon_m = 0.4;                                          ///< tolerance of (2.3)
-  ConsistencyMethod method = ConsistencyMethod::kPartitioned2D;    ///< all give the same graph
-  double cache_theta_m = 3.0;                                      ///< theta of (3.19), for kCached
+  double epsilon_m = 0.4;                                        ///< tolerance of (2.3), > 0
+  ConsistencyMethod method = ConsistencyMethod::kPartitioned2D;  ///< all give the same graph
+  double cache_theta_m = 3.0;                                    ///< theta of (3.19), for kCached and kAuto, > 0
+  /// Both maps have z roughly along gravity: the height difference of a pair may differ between the maps by at most
+  /// epsilon plus this slope (metres per metre of the pair's distance; a tilt in radians suffices). Infinity: no limit.
+  double max_vertical_slope = 0.1;
+  bool use_avx2 = true;  ///< on processors that have it; the edges are the same without
 };
 
-/// True if the pair satisfies (2.3), |d_l - d_t| <= epsilon, and shares neither a local nor a target segment.
-bool AreConsistent(const Correspondence& a, const Correspondence& b, double epsilon_m);
+/// The predicate that decides on every edge, in double precision: true if the pair shares neither a local nor a target
+/// segment, satisfies (2.3), |d_l - d_t| <= epsilon, and |dz_l - dz_t| <= epsilon + max_vertical_slope * d_l.
+/// A rotation by a tilt of at most max_vertical_slope radians changes a height difference by no more than the latter.
+/// False for coordinates that are not finite or beyond 1e12 m.
+bool AreConsistent(const Correspondence& a, const Correspondence& b, double epsilon_m,
+                   double max_vertical_slope = std::numeric_limits<double>::infinity());
 
-/// Builds the graph, statelessly for all methods but kCached, which remembers candidates between calls.
-/// Every method returns the same edges.
+/// Builds the graph, statelessly for all methods but kCached and kAuto, which remember candidates between calls.
+/// Every method returns the same edges, those for which AreConsistent holds.
+///
+/// Squares: the grid has squares of side b + epsilon, b an upper bound of the 3-D distance between any two local
+/// centroids, each divided into four by four; a correspondence looks only as far as its own local centroid is from the
+/// farthest other one. Pairs are screened in single precision, relative to the middle of each map, with a tolerance
+/// widened by the rounding that the maps' extents allow; the predicate decides on what remains.
+///
+/// Cache: a correspondence (by the keys of both segments) keeps those candidates for which |d_l - d_t| between the
+/// anchors, where both were when they were cached, is at most theta + epsilon. It is cached anew once the drifts of its
+/// local and its target centroid from their anchors sum to theta / 2 or more; so any pair that is consistent now is
+/// among the candidates. The candidates are tested again only once the two have moved far enough to change the answer.
+///
+/// Not thread-safe; one builder per thread.
 class ConsistencyGraphBuilder {
  public:
+  /// Throws std::invalid_argument naming the parameter that is out of range.
   explicit ConsistencyGraphBuilder(const ConsistencyParameters& parameters);
   ~ConsistencyGraphBuilder();
   ConsistencyGraphBuilder(ConsistencyGraphBuilder&&) noexcept;
   ConsistencyGraphBuilder& operator=(ConsistencyGraphBuilder&&) noexcept;
 
+  /// Vertex i of the graph is correspondences[i]. A correspondence without usable coordinates has no edges.
   ConsistencyGraph Build(const Correspondences& correspondences);
 
  private:

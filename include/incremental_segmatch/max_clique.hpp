@@ -12,20 +12,38 @@
 namespace incremental_segmatch {
 
 struct MaxCliqueParameters {
-  std::size_t min_size = 6;                                  ///< T: smaller cliques are no answer; >= 3
-  std::chrono::microseconds deadline{100000};                ///< then the incumbent is returned, unproven
+  std::size_t min_size = 6;                    ///< T: smaller cliques are no answer; >= 3
+  std::chrono::microseconds deadline{100000};  ///< then the incumbent is returned, unproven; > 0
+  /// How many maximum cliques are compared at most; 1 takes the first one found.
+  std::size_t max_ties = 1000;
+  /// Effort of the search for further maximum cliques, in 64-bit words of bit sets touched. A count and not a time, so
+  /// that the answer is repeatable. 4 million take some milliseconds.
+  std::uint64_t max_tie_work = 4000000;
 };
 
 struct MaxCliqueResult {
-  std::vector<std::uint32_t> vertices;   ///< sorted; empty if no clique of min_size was found
-  std::size_t upper_bound = 0;           ///< no clique is larger than this
-  bool proven_maximum = true;            ///< false if the deadline ended the search
+  std::vector<std::uint32_t> vertices;  ///< sorted; empty if no clique of min_size was found
+  std::size_t upper_bound = 0;          ///< no clique is larger than this (min_size - 1 where there is proof of none)
+  bool proven_maximum = true;           ///< false if the deadline ended the search
+  bool all_ties_compared = true;        ///< false if max_ties, max_tie_work or the deadline ended the comparison
 };
 
-/// Of several maximum cliques the one that `better(a, b)` prefers is returned (a strict weak order over sorted vertex
-/// lists); without it the lexicographically smallest list.
+/// A strict weak order over sorted vertex lists: true if the first one is the better answer.
+using CliqueOrder = std::function<bool(const std::vector<std::uint32_t>&, const std::vector<std::uint32_t>&)>;
+
+/// A maximum clique of at least min_size vertices. Of several the one that `better` prefers is returned; without it the
+/// lexicographically smallest list.
+///
+/// Vertices that are in no core of order min_size - 1 are dropped, the others visited in degeneracy order (bucket sort,
+/// Batagelj and Zaversnik); each one's later neighbourhood is searched by branch and bound on bit sets with greedy
+/// colouring and recolouring as bound (after Tomita et al., MCS). A second pass, only when the size is proven, looks
+/// through the cliques of that size for the best of them.
+///
+/// Deterministic for a given labelling of the vertices unless the deadline passes. Where all_ties_compared the answer
+/// does not depend on the labelling either, given that `better` does not; label by something canonical for the rest.
+/// Exponential in the worst case, near O(vertices + edges) where few vertices survive the cores. Throws
+/// std::invalid_argument naming a parameter that is out of range.
 MaxCliqueResult FindMaxClique(const ConsistencyGraph& graph, const MaxCliqueParameters& parameters,
-                              const std::function<bool(const std::vector<std::uint32_t>&,
-                                                       const std::vector<std::uint32_t>&)>& better = {});
+                              const CliqueOrder& better = {});
 
 }  // namespace incremental_segmatch

@@ -2,6 +2,7 @@
 /// Correspondences to a recognition with its evidence (METHOD 5; thesis 3.4).
 #pragma once
 
+#include <chrono>
 #include <optional>
 #include <vector>
 
@@ -11,22 +12,33 @@
 namespace incremental_segmatch {
 
 struct RecognizerParameters {
-  ConsistencyParameters consistency;
+  ConsistencyParameters consistency;  ///< its max_vertical_slope must be at least max_tilt_rad
   MaxCliqueParameters clique;
-  double max_tilt_rad = 0.1;           ///< between the two gravity-aligned maps; refuses mirrored fits
-  double max_rms_m = 0.4;              ///< residual of the fit over all inliers
-  double min_spread_m = 1.0;           ///< second largest standard deviation of the inlier centroids; refuses lines
+  double max_tilt_rad = 0.1;   ///< between the two gravity-aligned maps; refuses mirrored fits; 0 to pi
+  double max_rms_m = 0.4;      ///< residual of the fit over all inliers, > 0
+  double min_spread_m = 1.0;   ///< second largest standard deviation of the inlier centroids; refuses lines; > 0
+  double min_sigma_m = 0.05;   ///< floor of a centroid's standard deviation per axis in the covariance, > 0
+  bool find_runner_up = true;  ///< also look for the best clique beside the winner: evidence against ambiguity
+  std::chrono::microseconds runner_up_deadline{20000};  ///< of that search, > 0
 };
 
 /// Why there was no recognition, or that there was one.
 enum class RecognitionOutcome { kAccepted, kTooFewCandidates, kCliqueTooSmall, kDegenerate, kTilted, kLargeResidual };
 
 struct Recognition {
-  Pose T_target_local = Pose::Identity();     ///< p_map = T * p_odom, least squares over all inliers (Umeyama, no scale)
-  Covariance6 covariance = Covariance6::Identity();  ///< of T_target_local, perturbation on the left: exp(xi) T
-  std::vector<Correspondence> inliers;        ///< sorted by (local, target)
-  double rms_m = 0.0;                         ///< residual over the inliers
-  bool proven_maximum = true;
+  Pose T_target_local = Pose::Identity();  ///< p_map = T * p_odom, least squares over all inliers (Umeyama, no scale)
+  /// Of T_target_local in ROS's order (x, y, z, rotation about x, y, z, metres and radians), perturbation on the left:
+  /// T_true = exp(xi) T, in the axes and about the origin of the target map, to first order (see TransformCovariance).
+  Covariance6 covariance = Covariance6::Identity();
+  std::vector<Correspondence> inliers;  ///< sorted by (local, target)
+  double rms_m = 0.0;                   ///< root mean square distance of the inliers after the fit
+  double tilt_rad = 0.0;                ///< angle between the z axes of the two maps
+  bool proven_maximum = true;           ///< false if the deadline ended the search for a larger clique
+  std::size_t max_inliers = 0;          ///< no clique is larger than this; inliers.size() if proven
+  /// Size of the largest clique that shares no correspondence with the inliers: near inliers.size() means that the
+  /// place is ambiguous. 0 if it is smaller than 3 or than half of the inliers, or not looked for. A lower bound if
+  /// runner_up_deadline ended the search.
+  std::size_t runner_up_size = 0;
 };
 
 struct RecognizerResult {
@@ -35,16 +47,26 @@ struct RecognizerResult {
   std::size_t candidates = 0;
   std::size_t edges = 0;
   std::uint64_t tested_pairs = 0;
-  std::size_t clique_size = 0;                ///< of the best clique found, 0 below the smallest acceptable size
+  std::size_t clique_size = 0;  ///< of the best clique found, 0 below the smallest acceptable size
   double graph_ms = 0.0;
-  double clique_ms = 0.0;
+  double clique_ms = 0.0;  ///< including the search for the runner-up
   double transform_ms = 0.0;
 };
 
+/// Covariance of the least-squares transform of points to `points_target` (the transformed points, target frame) with
+/// independent errors of `sigma_m` per axis: sigma^2 (J^T J)^-1, J the Jacobian of the residuals by the perturbation on
+/// the left, exp(xi) T, xi = (translation, rotation). Computed about the points' centroid, where the two parts are
+/// uncorrelated, and carried to the frame's origin; far from it the translation inherits the rotation's uncertainty
+/// times the lever arm. The points must not be collinear.
+Covariance6 TransformCovariance(const std::vector<Eigen::Vector3d>& points_target, double sigma_m);
+
 /// Maximum geometrically consistent set of the correspondences and its rigid transform. No prior on the pose enters.
-/// The result does not depend on the order of the correspondences.
+/// The result does not depend on the order of the correspondences, which are sorted by their keys first; of several
+/// maximum sets the one with the smaller residual (to the micrometre) wins, then the smallest list of keys.
+/// Not thread-safe (the cached graph has state); one recognizer per robot and thread.
 class Recognizer {
  public:
+  /// Throws std::invalid_argument naming the parameter that is out of range.
   explicit Recognizer(const RecognizerParameters& parameters);
   RecognizerResult Recognize(const Correspondences& correspondences);
 

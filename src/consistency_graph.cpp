@@ -1,0 +1,724 @@
+#include "incremental_segmatch/consistency_graph.hpp"
+
+#include <algorithm>
+#include <array>
+#include <chrono>
+#include <cmath>
+#include <optional>
+#include <stdexcept>
+#include <string>
+
+#include "radix_sort.hpp"
+
+#if defined(__GNUC__) && defined(__x86_64__)
+#define SEGMATCH_HAS_AVX2_KERNEL
+#include <immintrin.h>
+#endif
+
+namespace incremental_segmatch {
+namespace {
+
+constexpr double kInfinity = std::numeric_limits<double>::infinity();
+
+/// What the predicate needs of a correspondence, in one cache line.
+struct Match {
+  Eigen::Vector3d local;
+  Eigen::Vector3d target;
+  std::uint64_t local_key;
+  std::uint64_t target_key;
+};
+
+std::uint64_t Packed(const SegmentKey& key) {
+  return (std::uint64_t{key.robot} << 32) | key.id;
+}
+
+Match MakeMatch(const Correspondence& c) {
+  return {c.centroid_local, c.centroid_target, Packed(c.local), Packed(c.target)};
+}
+
+/// Larger coordinates, and such that are not numbers, are no positions; far below where squares overflow.
+constexpr double kLargestCoordinate_m = 1e12;
+
+bool IsUsable(const Match& match) {
+  return (match.local.array().abs() <= kLargestCoordinate_m).all() &&
+         (match.target.array().abs() <= kLargestCoordinate_m).all();
+}
+
+double Distance(const Eigen::Vector3d& a, const Eigen::Vector3d& b) {
+  const double x = a.x() - b.x();
+  const double y = a.y() - b.y();
+  const double z = a.z() - b.z();
+  return std::sqrt(x * x + y * y + z * z);
+}
+
+bool ShareSegment(const Match& a, const Match& b) {
+  return a.local_key == b.local_key || a.target_key == b.target_key;
+}
+
+/// How far a pair is from violating each of the two inequalities; negative if it does.
+struct Margins {
+  double distance = 0.0;  ///< epsilon - |d_l - d_t|
+  double height = 0.0;    ///< epsilon + slope * d_l - |dz_l - dz_t|
+  bool consistent() const { return distance >= 0.0 && height >= 0.0; }
+};
+
+Margins MarginsOf(const Match& a, const Match& b, double epsilon_m, double max_vertical_slope) {
+  const double d_local = Distance(a.local, b.local);
+  const double d_target = Distance(a.target, b.target);
+  const double rise = std::abs((a.local.z() - b.local.z()) - (a.target.z() - b.target.z()));
+  // Infinity times a zero distance would be no number.
+  const double allowance = max_vertical_slope == kInfinity ? kInfinity : epsilon_m + max_vertical_slope * d_local;
+  return {epsilon_m - std::abs(d_local - d_target), allowance - rise};
+}
+
+/// The one predicate behind every method.
+bool Consistent(const Match& a, const Match& b, double epsilon_m, double max_vertical_slope) {
+  return !ShareSegment(a, b) && MarginsOf(a, b, epsilon_m, max_vertical_slope).consistent();
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Screening in single precision
+
+/// Coordinates of matches in single precision, relative to the middle of each map and scaled below one, and the
+/// tolerance that covers their rounding.
+///
+/// With all coordinates at most E from their middle and u = 2^-24, a coordinate is off by at most u E, a difference by
+/// 4 u E, a distance by 7 u E for that and by another 7 u E for the rounding of its square. Both distances together:
+/// 28 u E. The kernels compare squares, (d_l^2 - d_t^2)^2 <= 2 tol^2 (d_l^2 + d_t^2), which follows from
+/// |d_l - d_t| <= tol because (d_l + d_t)^2 <= 2 (d_l^2 + d_t^2), without a root; their rounding is a factor of
+/// 1 + 8 u on tol. 64 u E and 1 + 2^-16 leave a wide margin to both.
+struct ScreenArrays {
+  std::array<std::vector<float>, 6> coordinates;  ///< local x, y, z, target x, y, z; padded to full vectors
+  float factor = 0.f;                             ///< 2 tol^2
+};
+
+constexpr std::size_t kLanes = 8;
+
+struct Bounds {
+  Eigen::Vector3d low = Eigen::Vector3d::Constant(kInfinity);
+  Eigen::Vector3d high = Eigen::Vector3d::Constant(-kInfinity);
+
+  void Add(const Eigen::Vector3d& p) {
+    low = low.cwiseMin(p);
+    high = high.cwiseMax(p);
+  }
+  Eigen::Vector3d middle() const { return 0.5 * low + 0.5 * high; }
+  double half_extent() const { return (0.5 * high - 0.5 * low).maxCoeff(); }
+  double largest_coordinate() const { return std::max(low.cwiseAbs().maxCoeff(), high.cwiseAbs().maxCoeff()); }
+};
+
+ScreenArrays MakeScreenArrays(const std::vector<Match>& matches, const Bounds& local, const Bounds& target,
+                              double tolerance_m) {
+  constexpr double kFloatRounding = 1.0 / (1 << 24);
+  constexpr double kDoubleRounding = 1e-15;
+  ScreenArrays arrays;
+  for (auto& coordinate : arrays.coordinates) coordinate.assign(matches.size() + kLanes, 0.f);
+  if (matches.empty()) return arrays;
+
+  const double extent = std::max(local.half_extent(), target.half_extent());
+  const double rounding_m = 64.0 * kFloatRounding * extent +
+                            64.0 * kDoubleRounding * std::max(local.largest_coordinate(), target.largest_coordinate());
+  int exponent = 0;
+  std::frexp(extent + tolerance_m, &exponent);
+  const double scale = std::ldexp(1.0, -exponent);  // a power of two: scaling does not round
+  const double tolerance = (tolerance_m + rounding_m) * scale * (1.0 + 1.0 / (1 << 16));
+  arrays.factor = static_cast<float>(2.0 * tolerance * tolerance);
+
+  const Eigen::Vector3d local_middle = local.middle();
+  const Eigen::Vector3d target_middle = target.middle();
+  for (std::size_t i = 0; i < matches.size(); ++i) {
+    for (int axis = 0; axis < 3; ++axis) {
+      arrays.coordinates[axis][i] = static_cast<float>((matches[i].local[axis] - local_middle[axis]) * scale);
+      arrays.coordinates[3 + axis][i] = static_cast<float>((matches[i].target[axis] - target_middle[axis]) * scale);
+    }
+  }
+  return arrays;
+}
+
+/// Writes those of [begin, end) that may be within the tolerance of i to `hits` and returns their number.
+std::size_t ScreenPortable(const ScreenArrays& arrays, std::size_t i, std::size_t begin, std::size_t end,
+                           std::uint32_t* hits) {
+  const auto& c = arrays.coordinates;
+  std::size_t count = 0;
+  for (std::size_t j = begin; j < end; ++j) {
+    const float lx = c[0][j] - c[0][i], ly = c[1][j] - c[1][i], lz = c[2][j] - c[2][i];
+    const float tx = c[3][j] - c[3][i], ty = c[4][j] - c[4][i], tz = c[5][j] - c[5][i];
+    const float local = lx * lx + ly * ly + lz * lz;
+    const float target = tx * tx + ty * ty + tz * tz;
+    const float difference = local - target;
+    hits[count] = static_cast<std::uint32_t>(j);
+    count += difference * difference <= arrays.factor * (local + target) ? 1 : 0;
+  }
+  return count;
+}
+
+#ifdef SEGMATCH_HAS_AVX2_KERNEL
+/// The same as ScreenPortable, eight at a time.
+__attribute__((target("avx2"))) std::size_t ScreenAvx2(const ScreenArrays& arrays, std::size_t i, std::size_t begin,
+                                                       std::size_t end, std::uint32_t* hits) {
+  const float* const lx = arrays.coordinates[0].data();
+  const float* const ly = arrays.coordinates[1].data();
+  const float* const lz = arrays.coordinates[2].data();
+  const float* const tx = arrays.coordinates[3].data();
+  const float* const ty = arrays.coordinates[4].data();
+  const float* const tz = arrays.coordinates[5].data();
+  const __m256 lx_i = _mm256_set1_ps(lx[i]), ly_i = _mm256_set1_ps(ly[i]), lz_i = _mm256_set1_ps(lz[i]);
+  const __m256 tx_i = _mm256_set1_ps(tx[i]), ty_i = _mm256_set1_ps(ty[i]), tz_i = _mm256_set1_ps(tz[i]);
+  const __m256 factor = _mm256_set1_ps(arrays.factor);
+  std::size_t count = 0;
+  for (std::size_t j = begin; j < end; j += kLanes) {
+    const __m256 a = _mm256_sub_ps(_mm256_loadu_ps(lx + j), lx_i);
+    const __m256 b = _mm256_sub_ps(_mm256_loadu_ps(ly + j), ly_i);
+    const __m256 c = _mm256_sub_ps(_mm256_loadu_ps(lz + j), lz_i);
+    const __m256 d = _mm256_sub_ps(_mm256_loadu_ps(tx + j), tx_i);
+    const __m256 e = _mm256_sub_ps(_mm256_loadu_ps(ty + j), ty_i);
+    const __m256 f = _mm256_sub_ps(_mm256_loadu_ps(tz + j), tz_i);
+    const __m256 local = _mm256_add_ps(_mm256_add_ps(_mm256_mul_ps(a, a), _mm256_mul_ps(b, b)), _mm256_mul_ps(c, c));
+    const __m256 target = _mm256_add_ps(_mm256_add_ps(_mm256_mul_ps(d, d), _mm256_mul_ps(e, e)), _mm256_mul_ps(f, f));
+    const __m256 difference = _mm256_sub_ps(local, target);
+    const __m256 near = _mm256_cmp_ps(_mm256_mul_ps(difference, difference),
+                                      _mm256_mul_ps(factor, _mm256_add_ps(local, target)), _CMP_LE_OQ);
+    unsigned mask = static_cast<unsigned>(_mm256_movemask_ps(near));
+    if (end - j < kLanes) mask &= (1u << (end - j)) - 1u;
+    for (; mask != 0; mask &= mask - 1) {
+      hits[count++] = static_cast<std::uint32_t>(j) + static_cast<std::uint32_t>(__builtin_ctz(mask));
+    }
+  }
+  return count;
+}
+#endif
+
+using ScreenFunction = std::size_t (*)(const ScreenArrays&, std::size_t, std::size_t, std::size_t, std::uint32_t*);
+
+ScreenFunction ChooseScreen(bool use_avx2) {
+#ifdef SEGMATCH_HAS_AVX2_KERNEL
+  if (use_avx2 && __builtin_cpu_supports("avx2")) return ScreenAvx2;
+#endif
+  (void)use_avx2;
+  return ScreenPortable;
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Partitions
+
+enum class Layout { kOneCell, kSquares, kCubes };
+
+/// Matches sorted into cells over the target centroids: rows of squares along x, so that all squares of a row within
+/// reach are one contiguous range. Finds, for a match, those others for which |d_l - d_t| may be within the tolerance.
+class Partition {
+ public:
+  Partition(const std::vector<Match>& matches, double tolerance_m, Layout layout, bool use_avx2);
+
+  std::size_t size() const { return matches_.size(); }
+  const Match& match(std::uint32_t slot) const { return matches_[slot]; }
+  /// Index of the match in the list given to the constructor.
+  std::uint32_t index(std::uint32_t slot) const { return order_[slot]; }
+
+  /// Calls visit(slot, slot) once for each unordered pair that passes the screen; returns the number of pairs screened.
+  template <typename Visit>
+  std::uint64_t ForEachPair(Visit visit);
+
+  /// Calls visit(slot, other) for each other match that passes the screen, for those slots for which selected(slot);
+  /// returns the number of pairs screened.
+  template <typename Selected, typename Visit>
+  std::uint64_t ForEachPairOf(Selected selected, Visit visit);
+
+ private:
+  struct Row {
+    std::uint64_t key;           ///< z and y of its cells
+    std::uint32_t begin, end;    ///< its slots
+    std::uint64_t first_column;  ///< of the cells in its table
+    std::size_t columns;
+    std::size_t table;  ///< where its cells start in cell_begin_
+  };
+  struct Range {
+    std::uint32_t begin, end;
+  };
+  /// A row within reach and by how many rows it is away.
+  struct NearRow {
+    const Row* row;
+    int dy, dz;
+  };
+
+  static constexpr int kReach = 4;  ///< squares of side b + tolerance, divided by this
+
+  static std::uint64_t RowKey(std::uint64_t y, std::uint64_t z) { return (z << 32) | y; }
+  std::uint64_t Cell(double offset_m) const { return static_cast<std::uint64_t>(std::max(offset_m, 0.0) / side_m_); }
+  std::uint64_t Column(double offset_m) const { return Cell(offset_m) >> column_shift_; }
+  void SortIntoRows(const std::vector<Match>& matches);
+  void FillTables(const std::vector<std::uint64_t>& columns);
+  std::vector<NearRow> RowsNear(const Row& row, bool only_later) const;
+  double Gap(std::uint64_t cell, int step, double offset_m) const;
+  Range RangeIn(const NearRow& near, const Row& own, std::uint32_t slot) const;
+  template <typename Visit>
+  std::uint64_t ScreenRange(std::uint32_t slot, Range range, Visit& visit);
+
+  Layout layout_;
+  ScreenFunction screen_;
+  double slack_m_ = 0.0;  ///< covers the rounding of the grid's arithmetic
+  double side_m_ = 1.0;
+  int column_shift_ = 0;  ///< columns are 2^shift cells wide, so that tables stay small however far targets lie apart
+  Eigen::Vector3d origin_ = Eigen::Vector3d::Zero();
+  std::vector<std::uint32_t> order_;  ///< slot to index
+  std::vector<Match> matches_;        ///< by slot
+  std::vector<double> reach_m_;       ///< by slot: no consistent target is farther away
+  std::vector<Row> rows_;             ///< by key
+  std::vector<std::uint32_t> cell_begin_;
+  ScreenArrays arrays_;
+  std::vector<std::uint32_t> hits_;
+};
+
+Partition::Partition(const std::vector<Match>& matches, double tolerance_m, Layout layout, bool use_avx2)
+    : layout_(layout), screen_(ChooseScreen(use_avx2)) {
+  Bounds local, target;
+  for (const Match& match : matches) {
+    local.Add(match.local);
+    target.Add(match.target);
+  }
+  if (!matches.empty()) {
+    slack_m_ = 1e-12 * (local.largest_coordinate() + target.largest_coordinate() + tolerance_m);
+    origin_ = target.low;
+    // The farthest local centroid from the middle bounds the distance of any two: b = 2 farthest.
+    const Eigen::Vector3d middle = local.middle();
+    double farthest_m = 0.0;
+    for (const Match& match : matches) farthest_m = std::max(farthest_m, Distance(match.local, middle));
+    side_m_ = (2.0 * farthest_m + tolerance_m + 8.0 * slack_m_) * (1.0 + 1e-9) / kReach;
+    side_m_ = std::max(side_m_, target.half_extent() / (1 << 28));
+    SortIntoRows(matches);
+    reach_m_.reserve(matches_.size());
+    for (const Match& match : matches_) {
+      reach_m_.push_back(Distance(match.local, middle) + farthest_m + tolerance_m + 4.0 * slack_m_);
+    }
+  }
+  arrays_ = MakeScreenArrays(matches_, local, target, tolerance_m);
+  hits_.resize(matches_.size() + kLanes);
+}
+
+void Partition::SortIntoRows(const std::vector<Match>& matches) {
+  order_.resize(matches.size());
+  for (std::uint32_t i = 0; i < order_.size(); ++i) order_[i] = i;
+  std::vector<std::uint64_t> row_of(matches.size(), 0), column_of(matches.size(), 0);
+  if (layout_ != Layout::kOneCell) {
+    for (std::size_t i = 0; i < matches.size(); ++i) {
+      const Eigen::Vector3d offset = matches[i].target - origin_;
+      column_of[i] = Cell(offset.x());
+      row_of[i] = RowKey(Cell(offset.y()), layout_ == Layout::kCubes ? Cell(offset.z()) : 0);
+    }
+    order_ = SortedByKey(SortedByKey(std::move(order_), column_of), row_of);
+  }
+  matches_.reserve(matches.size());
+  for (const std::uint32_t i : order_) matches_.push_back(matches[i]);
+
+  for (std::uint32_t slot = 0; slot < order_.size(); ++slot) {
+    const std::uint64_t key = row_of[order_[slot]];
+    if (rows_.empty() || rows_.back().key != key) rows_.push_back({key, slot, slot, column_of[order_[slot]], 0, 0});
+    rows_.back().end = slot + 1;
+  }
+  FillTables(column_of);
+}
+
+void Partition::FillTables(const std::vector<std::uint64_t>& columns) {
+  const auto last_column = [&](const Row& row) { return columns[order_[row.end - 1]]; };
+  const std::size_t limit = 8 * order_.size() + 4096;
+  for (column_shift_ = 0;; ++column_shift_) {
+    std::size_t total = 0;
+    for (const Row& row : rows_) total += (last_column(row) >> column_shift_) - (row.first_column >> column_shift_) + 2;
+    if (total <= limit) break;
+  }
+  for (Row& row : rows_) {
+    row.columns = (last_column(row) >> column_shift_) - (row.first_column >> column_shift_) + 1;
+    row.first_column >>= column_shift_;
+    row.table = cell_begin_.size();
+    for (std::uint32_t slot = row.begin; slot < row.end; ++slot) {
+      const std::size_t column = (columns[order_[slot]] >> column_shift_) - row.first_column;
+      while (cell_begin_.size() <= row.table + column) cell_begin_.push_back(slot);
+    }
+    cell_begin_.push_back(row.end);
+  }
+}
+
+std::vector<Partition::NearRow> Partition::RowsNear(const Row& row, bool only_later) const {
+  std::vector<NearRow> near;
+  const auto y = static_cast<std::int64_t>(row.key & 0xffffffffu);
+  const auto z = static_cast<std::int64_t>(row.key >> 32);
+  const int reach_z = layout_ == Layout::kCubes ? kReach : 0;
+  const int reach_y = layout_ == Layout::kOneCell ? 0 : kReach;
+  for (int dz = only_later ? 0 : -reach_z; dz <= reach_z; ++dz) {
+    for (int dy = only_later && dz == 0 ? 0 : -reach_y; dy <= reach_y; ++dy) {
+      if (z + dz < 0 || y + dy < 0) continue;
+      const std::uint64_t key = RowKey(static_cast<std::uint64_t>(y + dy), static_cast<std::uint64_t>(z + dz));
+      const auto found =
+          std::lower_bound(rows_.begin(), rows_.end(), key, [](const Row& a, std::uint64_t b) { return a.key < b; });
+      if (found != rows_.end() && found->key == key) near.push_back({&*found, dy, dz});
+    }
+  }
+  return near;
+}
+
+/// Lower bound of the distance along one axis to the cells `step` away.
+double Partition::Gap(std::uint64_t cell, int step, double offset_m) const {
+  if (step == 0) return 0.0;
+  const double index = static_cast<double>(static_cast<std::int64_t>(cell) + step);
+  const double gap = step > 0 ? index * side_m_ - offset_m : offset_m - (index + 1.0) * side_m_;
+  return std::max(gap - slack_m_, 0.0);
+}
+
+Partition::Range Partition::RangeIn(const NearRow& near, const Row& own, std::uint32_t slot) const {
+  const Row& row = *near.row;
+  if (layout_ == Layout::kOneCell) return {row.begin, row.end};
+  const Eigen::Vector3d offset = matches_[slot].target - origin_;
+  const double gap_y = Gap(own.key & 0xffffffffu, near.dy, offset.y());
+  const double gap_z = Gap(own.key >> 32, near.dz, offset.z());
+  const double width_sq = reach_m_[slot] * reach_m_[slot] - gap_y * gap_y - gap_z * gap_z;
+  if (width_sq < 0.0) return {0, 0};
+  const double width = std::sqrt(width_sq) + slack_m_;
+  const std::uint64_t low = std::max(Column(offset.x() - width), row.first_column);
+  const std::uint64_t high = std::min(Column(offset.x() + width), row.first_column + row.columns - 1);
+  if (low > high) return {0, 0};
+  const std::uint32_t* const table = cell_begin_.data() + row.table;
+  return {table[low - row.first_column], table[high - row.first_column + 1]};
+}
+
+template <typename Visit>
+std::uint64_t Partition::ScreenRange(std::uint32_t slot, Range range, Visit& visit) {
+  if (range.begin >= range.end) return 0;
+  const std::size_t count = screen_(arrays_, slot, range.begin, range.end, hits_.data());
+  for (std::size_t k = 0; k < count; ++k) visit(slot, hits_[k]);
+  return range.end - range.begin;
+}
+
+template <typename Visit>
+std::uint64_t Partition::ForEachPair(Visit visit) {
+  std::uint64_t screened = 0;
+  for (const Row& row : rows_) {
+    const std::vector<NearRow> rows_near = RowsNear(row, true);
+    for (std::uint32_t slot = row.begin; slot < row.end; ++slot) {
+      for (const NearRow& near : rows_near) {
+        Range range = RangeIn(near, row, slot);
+        if (near.row == &row) range.begin = std::max(range.begin, slot + 1);
+        screened += ScreenRange(slot, range, visit);
+      }
+    }
+  }
+  return screened;
+}
+
+template <typename Selected, typename Visit>
+std::uint64_t Partition::ForEachPairOf(Selected selected, Visit visit) {
+  std::uint64_t screened = 0;
+  for (const Row& row : rows_) {
+    const std::vector<NearRow> rows_near = RowsNear(row, false);
+    for (std::uint32_t slot = row.begin; slot < row.end; ++slot) {
+      if (!selected(slot)) continue;
+      for (const NearRow& near : rows_near) screened += ScreenRange(slot, RangeIn(near, row, slot), visit);
+    }
+  }
+  return screened;
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Cache
+
+/// Remembers, per correspondence, which others may be consistent with it until one of the two has drifted too far.
+class Cache {
+ public:
+  explicit Cache(const ConsistencyParameters& parameters) : parameters_(parameters) {}
+
+  ConsistencyGraph Build(const Correspondences& correspondences);
+
+ private:
+  /// An older tracked correspondence that may become consistent with the owner of the list.
+  struct Candidate {
+    std::uint32_t track;
+    std::uint32_t generation : 31;  ///< of the track when the candidate was found; another one now: it has left
+    std::uint32_t consistent : 1;
+    double valid_until_m;  ///< the answer holds while the two tracks' travels sum to less
+  };
+  struct Track {
+    Match anchor;  ///< where it was cached
+    Match current;
+    std::vector<Candidate> candidates;
+  };
+  /// What the candidate lists look up, apart from the tracks to keep the look-ups near each other.
+  struct State {
+    double travel_m = 0.0;  ///< how far local and target centroid have moved, summed over all steps
+    std::uint32_t generation : 31;
+    std::uint32_t is_new : 1;  ///< cached in this step
+    std::uint32_t vertex = 0;  ///< its index in this step's input
+    State() : generation(0), is_new(0) {}
+  };
+
+  void Follow(const Correspondences& correspondences);
+  void Continue(std::uint32_t track, const Match& match, std::uint32_t vertex);
+  void Insert(const Match& match, std::uint32_t vertex);
+  void Remove(std::uint32_t track);
+  void Test(const Match& own, double own_travel_m, Candidate& candidate);
+  void TestKnownCandidates(std::vector<ConsistencyGraph::Edge>& edges);
+  void FindNewCandidates(std::vector<ConsistencyGraph::Edge>& edges);
+
+  ConsistencyParameters parameters_;
+  std::vector<Track> tracks_;
+  std::vector<State> states_;          ///< by track
+  std::vector<std::uint32_t> free_;    ///< tracks without a correspondence
+  std::vector<std::uint32_t> sorted_;  ///< tracks in use, by key
+  std::uint64_t tested_pairs_ = 0;
+};
+
+bool KeyLess(const Match& a, const Match& b) {
+  return std::tie(a.local_key, a.target_key) < std::tie(b.local_key, b.target_key);
+}
+
+ConsistencyGraph Cache::Build(const Correspondences& correspondences) {
+  tested_pairs_ = 0;
+  Follow(correspondences);
+  std::vector<ConsistencyGraph::Edge> edges;
+  TestKnownCandidates(edges);
+  FindNewCandidates(edges);
+  ConsistencyGraph graph = ConsistencyGraph::FromEdges(correspondences.size(), edges);
+  graph.tested_pairs = tested_pairs_;
+  return graph;
+}
+
+/// Joins the sorted keys of the last step with those of this one: what is in both goes on, the others leave or enter.
+void Cache::Follow(const Correspondences& correspondences) {
+  std::vector<Match> matches;
+  std::vector<std::uint64_t> local_keys, target_keys;
+  std::vector<std::uint32_t> order;
+  matches.reserve(correspondences.size());
+  for (const Correspondence& c : correspondences) {
+    matches.push_back(MakeMatch(c));
+    local_keys.push_back(matches.back().local_key);
+    target_keys.push_back(matches.back().target_key);
+    if (IsUsable(matches.back())) order.push_back(static_cast<std::uint32_t>(matches.size() - 1));
+  }
+  order = SortedByKey(SortedByKey(std::move(order), target_keys), local_keys);
+
+  std::vector<std::uint32_t> last = std::move(sorted_);
+  sorted_.clear();
+  auto old = last.begin();
+  for (const std::uint32_t vertex : order) {
+    for (; old != last.end() && KeyLess(tracks_[*old].current, matches[vertex]); ++old) Remove(*old);
+    if (old != last.end() && !KeyLess(matches[vertex], tracks_[*old].current)) {
+      Continue(*old++, matches[vertex], vertex);
+    } else {
+      Insert(matches[vertex], vertex);
+    }
+  }
+  for (; old != last.end(); ++old) Remove(*old);
+}
+
+void Cache::Continue(std::uint32_t index, const Match& match, std::uint32_t vertex) {
+  Track& track = tracks_[index];
+  const double drift_m = Distance(match.local, track.anchor.local) + Distance(match.target, track.anchor.target);
+  if (drift_m >= 0.5 * parameters_.cache_theta_m) {
+    Remove(index);
+    Insert(match, vertex);
+    return;
+  }
+  State& state = states_[index];
+  state.travel_m += Distance(match.local, track.current.local) + Distance(match.target, track.current.target);
+  state.is_new = 0;
+  state.vertex = vertex;
+  track.current = match;
+  sorted_.push_back(index);
+}
+
+void Cache::Insert(const Match& match, std::uint32_t vertex) {
+  if (free_.empty()) {
+    free_.push_back(static_cast<std::uint32_t>(tracks_.size()));
+    tracks_.emplace_back();
+    states_.emplace_back();
+  }
+  const std::uint32_t index = free_.back();
+  free_.pop_back();
+  tracks_[index].anchor = tracks_[index].current = match;
+  states_[index].travel_m = 0.0;
+  states_[index].is_new = 1;
+  states_[index].vertex = vertex;
+  sorted_.push_back(index);
+}
+
+void Cache::Remove(std::uint32_t track) {
+  tracks_[track].candidates.clear();
+  states_[track].generation = states_[track].generation + 1;
+  free_.push_back(track);
+}
+
+/// Decides on a pair and on how long the answer holds: moving a centroid by a step changes the first margin by at most
+/// that step, the second by at most (1 + slope) times it.
+void Cache::Test(const Match& own, double own_travel_m, Candidate& candidate) {
+  const Match& other = tracks_[candidate.track].current;
+  const double slope = parameters_.max_vertical_slope;
+  const Margins margins = MarginsOf(own, other, parameters_.epsilon_m, slope);
+  ++tested_pairs_;
+  candidate.consistent = margins.consistent();
+  const double height = slope == kInfinity ? kInfinity : margins.height / (1.0 + slope);
+  const double room_m =
+      candidate.consistent ? std::min(margins.distance, height) : std::max(-margins.distance, -height);
+  const double rounding_m = 1e-9 + 1e-13 * (own.local.cwiseAbs().sum() + own.target.cwiseAbs().sum() +
+                                            other.local.cwiseAbs().sum() + other.target.cwiseAbs().sum());
+  candidate.valid_until_m = own_travel_m + states_[candidate.track].travel_m + room_m - rounding_m;
+}
+
+void Cache::TestKnownCandidates(std::vector<ConsistencyGraph::Edge>& edges) {
+  for (const std::uint32_t index : sorted_) {
+    Track& track = tracks_[index];
+    const State state = states_[index];
+    std::size_t kept = 0;
+    for (Candidate candidate : track.candidates) {
+      const State& other = states_[candidate.track];
+      if (other.generation != candidate.generation) continue;
+      if (state.travel_m + other.travel_m >= candidate.valid_until_m) Test(track.current, state.travel_m, candidate);
+      if (candidate.consistent) edges.emplace_back(state.vertex, other.vertex);
+      track.candidates[kept++] = candidate;
+    }
+    track.candidates.resize(kept);
+  }
+}
+
+void Cache::FindNewCandidates(std::vector<ConsistencyGraph::Edge>& edges) {
+  std::vector<Match> anchors;
+  bool any_new = false;
+  anchors.reserve(sorted_.size());
+  for (const std::uint32_t index : sorted_) {
+    anchors.push_back(tracks_[index].anchor);
+    any_new = any_new || states_[index].is_new;
+  }
+  if (!any_new) return;
+  constexpr double kRounding_m = 1e-6;
+  const double tolerance_m = parameters_.cache_theta_m + parameters_.epsilon_m + kRounding_m;
+  Partition partition(anchors, tolerance_m, Layout::kSquares, parameters_.use_avx2);
+  const auto is_new = [&](std::uint32_t slot) { return states_[sorted_[partition.index(slot)]].is_new == 1; };
+  tested_pairs_ += partition.ForEachPairOf(is_new, [&](std::uint32_t slot, std::uint32_t other_slot) {
+    if (other_slot == slot || (other_slot > slot && is_new(other_slot))) return;  // new pairs once
+    const Match& own = partition.match(slot);
+    const Match& other = partition.match(other_slot);
+    if (ShareSegment(own, other)) return;
+    const std::uint32_t index = sorted_[partition.index(slot)];
+    const std::uint32_t other_index = sorted_[partition.index(other_slot)];
+    Candidate candidate{other_index, states_[other_index].generation, 0, 0.0};
+    Test(own, 0.0, candidate);
+    if (candidate.consistent) edges.emplace_back(states_[index].vertex, states_[other_index].vertex);
+    tracks_[index].candidates.push_back(candidate);
+  });
+}
+
+// ---------------------------------------------------------------------------------------------------------------------
+
+void Validate(const ConsistencyParameters& parameters) {
+  const auto require = [](bool good, const char* message) {
+    if (!good) throw std::invalid_argument(std::string("ConsistencyParameters: ") + message);
+  };
+  require(parameters.epsilon_m > 0.0 && std::isfinite(parameters.epsilon_m), "epsilon_m must be positive and finite");
+  require(parameters.cache_theta_m > 0.0 && std::isfinite(parameters.cache_theta_m),
+          "cache_theta_m must be positive and finite");
+  require(parameters.max_vertical_slope >= 0.0, "max_vertical_slope must not be negative (infinity: no limit)");
+}
+
+}  // namespace
+
+bool ConsistencyGraph::HasEdge(std::uint32_t a, std::uint32_t b) const {
+  const Range range = Neighbours(a);
+  return std::binary_search(range.begin(), range.end(), b);
+}
+
+ConsistencyGraph ConsistencyGraph::FromEdges(std::size_t vertices, const std::vector<Edge>& edges) {
+  ConsistencyGraph graph;
+  graph.edges = edges.size();
+  graph.offsets.assign(vertices + 1, 0);
+  for (const auto& [a, b] : edges) {
+    ++graph.offsets[a + 1];
+    ++graph.offsets[b + 1];
+  }
+  for (std::size_t v = 0; v < vertices; ++v) graph.offsets[v + 1] += graph.offsets[v];
+
+  std::vector<std::uint32_t> unsorted(2 * edges.size());
+  std::vector<std::size_t> next(graph.offsets.begin(), graph.offsets.end() - 1);
+  for (const auto& [a, b] : edges) {
+    unsorted[next[a]++] = b;
+    unsorted[next[b]++] = a;
+  }
+  // Turning the rows into columns, vertex after vertex, leaves every row sorted.
+  graph.neighbours.resize(unsorted.size());
+  next.assign(graph.offsets.begin(), graph.offsets.end() - 1);
+  for (std::uint32_t v = 0; v < vertices; ++v) {
+    for (std::size_t k = graph.offsets[v]; k < graph.offsets[v + 1]; ++k) graph.neighbours[next[unsorted[k]]++] = v;
+  }
+  return graph;
+}
+
+bool AreConsistent(const Correspondence& a, const Correspondence& b, double epsilon_m, double max_vertical_slope) {
+  const Match match_a = MakeMatch(a);
+  const Match match_b = MakeMatch(b);
+  return IsUsable(match_a) && IsUsable(match_b) && Consistent(match_a, match_b, epsilon_m, max_vertical_slope);
+}
+
+class ConsistencyGraphBuilder::Impl {
+ public:
+  explicit Impl(const ConsistencyParameters& parameters) : parameters_(parameters), cache_(parameters) {}
+
+  ConsistencyGraph Build(const Correspondences& correspondences) {
+    return parameters_.method == ConsistencyMethod::kAuto ? BuildWithFastest(correspondences)
+                                                          : BuildWith(parameters_.method, correspondences);
+  }
+
+ private:
+  ConsistencyGraph BuildWith(ConsistencyMethod method, const Correspondences& correspondences) {
+    switch (method) {
+      case ConsistencyMethod::kCached:
+        return cache_.Build(correspondences);
+      case ConsistencyMethod::kPartitioned2D:
+        return BuildPartitioned(correspondences, Layout::kSquares);
+      case ConsistencyMethod::kPartitioned3D:
+        return BuildPartitioned(correspondences, Layout::kCubes);
+      default:
+        return BuildPartitioned(correspondences, Layout::kOneCell);
+    }
+  }
+
+  ConsistencyGraph BuildPartitioned(const Correspondences& correspondences, Layout layout) const {
+    std::vector<Match> matches;
+    std::vector<std::uint32_t> vertices;
+    matches.reserve(correspondences.size());
+    vertices.reserve(correspondences.size());
+    for (std::uint32_t v = 0; v < correspondences.size(); ++v) {
+      const Match match = MakeMatch(correspondences[v]);
+      if (!IsUsable(match)) continue;
+      matches.push_back(match);
+      vertices.push_back(v);
+    }
+    std::vector<ConsistencyGraph::Edge> edges;
+    Partition partition(matches, parameters_.epsilon_m, layout, parameters_.use_avx2);
+    const std::uint64_t tested = partition.ForEachPair([&](std::uint32_t a, std::uint32_t b) {
+      if (Consistent(partition.match(a), partition.match(b), parameters_.epsilon_m, parameters_.max_vertical_slope)) {
+        edges.emplace_back(vertices[partition.index(a)], vertices[partition.index(b)]);
+      }
+    });
+    ConsistencyGraph graph = ConsistencyGraph::FromEdges(correspondences.size(), edges);
+    graph.tested_pairs = tested;
+    return graph;
+  }
+
+  ConsistencyGraph BuildWithFastest(const Correspondences& correspondences);
+
+  ConsistencyParameters parameters_;
+  Cache cache_;
+};
+
+ConsistencyGraph ConsistencyGraphBuilder::Impl::BuildWithFastest(const Correspondences& correspondences) {
+  return BuildWith(ConsistencyMethod::kPartitioned2D, correspondences);
+}
+
+ConsistencyGraphBuilder::ConsistencyGraphBuilder(const ConsistencyParameters& parameters) {
+  Validate(parameters);
+  impl_ = std::make_unique<Impl>(parameters);
+}
+ConsistencyGraphBuilder::~ConsistencyGraphBuilder() = default;
+ConsistencyGraphBuilder::ConsistencyGraphBuilder(ConsistencyGraphBuilder&&) noexcept = default;
+ConsistencyGraphBuilder& ConsistencyGraphBuilder::operator=(ConsistencyGraphBuilder&&) noexcept = default;
+
+ConsistencyGraph ConsistencyGraphBuilder::Build(const Correspondences& correspondences) {
+  return impl_->Build(correspondences);
+}
+
+}  // namespace incremental_segmatch

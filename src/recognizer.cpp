@@ -1,0 +1,266 @@
+#include "incremental_segmatch/recognizer.hpp"
+
+#include <Eigen/Eigenvalues>
+#include <Eigen/LU>
+#include <algorithm>
+#include <chrono>
+#include <cmath>
+#include <stdexcept>
+#include <string>
+#include <tuple>
+#include <utility>
+
+#include "radix_sort.hpp"
+
+namespace incremental_segmatch {
+namespace {
+
+using Clock = std::chrono::steady_clock;
+using Vertices = std::vector<std::uint32_t>;
+
+double MillisecondsSince(Clock::time_point start) {
+  return std::chrono::duration<double, std::milli>(Clock::now() - start).count();
+}
+
+std::uint64_t Packed(const SegmentKey& key) {
+  return (std::uint64_t{key.robot} << 32) | key.id;
+}
+
+auto Values(const Correspondence& c) {
+  return std::make_tuple(c.centroid_local.x(), c.centroid_local.y(), c.centroid_local.z(), c.centroid_target.x(),
+                         c.centroid_target.y(), c.centroid_target.z(), c.descriptor_distance);
+}
+
+/// By the keys of local and target segment; by their values where somebody gives the same pair twice.
+Correspondences SortedCanonically(const Correspondences& correspondences) {
+  std::vector<std::uint64_t> local_keys, target_keys;
+  Vertices order(correspondences.size());
+  local_keys.reserve(order.size());
+  target_keys.reserve(order.size());
+  for (std::uint32_t i = 0; i < order.size(); ++i) {
+    order[i] = i;
+    local_keys.push_back(Packed(correspondences[i].local));
+    target_keys.push_back(Packed(correspondences[i].target));
+  }
+  order = SortedByKey(SortedByKey(std::move(order), target_keys), local_keys);
+  Correspondences sorted;
+  sorted.reserve(order.size());
+  for (const std::uint32_t i : order) sorted.push_back(correspondences[i]);
+
+  const auto same_pair = [](const Correspondence& a, const Correspondence& b) {
+    return a.local == b.local && a.target == b.target;
+  };
+  for (auto first = sorted.begin(); first != sorted.end();) {
+    auto last = first + 1;
+    while (last != sorted.end() && same_pair(*first, *last)) ++last;
+    if (last - first > 1) {
+      std::sort(first, last, [](const Correspondence& a, const Correspondence& b) { return Values(a) < Values(b); });
+    }
+    first = last;
+  }
+  return sorted;
+}
+
+/// Centroids of some correspondences, 3 x n, metres.
+struct PointPairs {
+  Eigen::Matrix3Xd local;
+  Eigen::Matrix3Xd target;
+};
+
+PointPairs PointPairsOf(const Correspondences& correspondences, const Vertices& vertices) {
+  PointPairs pairs{Eigen::Matrix3Xd(3, vertices.size()), Eigen::Matrix3Xd(3, vertices.size())};
+  for (std::size_t i = 0; i < vertices.size(); ++i) {
+    pairs.local.col(i) = correspondences[vertices[i]].centroid_local;
+    pairs.target.col(i) = correspondences[vertices[i]].centroid_target;
+  }
+  return pairs;
+}
+
+/// Least-squares T_target_local (Umeyama, no scale).
+Pose FitTransform(const PointPairs& pairs) {
+  return Pose(Eigen::umeyama(pairs.local, pairs.target, false));
+}
+
+double RootMeanSquareResidual(const PointPairs& pairs, const Pose& T_target_local) {
+  const Eigen::Matrix3Xd moved = (T_target_local.linear() * pairs.local).colwise() + T_target_local.translation();
+  return std::sqrt((moved - pairs.target).squaredNorm() / static_cast<double>(pairs.local.cols()));
+}
+
+/// Second largest standard deviation of the points along their principal axes: 0 for points on a line.
+double SecondSpread(const Eigen::Matrix3Xd& points) {
+  const Eigen::Matrix3Xd centred = points.colwise() - points.rowwise().mean();
+  const Eigen::Matrix3d covariance = centred * centred.transpose() / static_cast<double>(points.cols());
+  return std::sqrt(std::max(Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d>(covariance).eigenvalues()[1], 0.0));
+}
+
+/// Angle between the z axis and the transformed z axis.
+double TiltOf(const Pose& T) {
+  const Eigen::Vector3d up = T.linear().col(2);
+  return std::atan2(up.head<2>().norm(), up.z());
+}
+
+Eigen::Matrix3d CrossMatrix(const Eigen::Vector3d& v) {
+  Eigen::Matrix3d m;
+  m << 0.0, -v.z(), v.y(), v.z(), 0.0, -v.x(), -v.y(), v.x(), 0.0;
+  return m;
+}
+
+/// Prefers the clique with the smaller residual, then the smaller list of vertices, which are sorted by key. Residuals
+/// are compared to the micrometre: exact ties must not be decided by rounding, or a turned map would turn the choice.
+class SmallerResidual {
+ public:
+  explicit SmallerResidual(const Correspondences& correspondences) : correspondences_(correspondences) {}
+
+  bool operator()(const Vertices& a, const Vertices& b) {
+    if (b != last_) {
+      last_ = b;
+      last_residual_ = Residual_um(b);
+    }
+    const double residual = Residual_um(a);
+    if (std::tie(residual, a) >= std::tie(last_residual_, b)) return false;
+    last_ = a;  // becomes the incumbent, which the next call compares with
+    last_residual_ = residual;
+    return true;
+  }
+
+ private:
+  double Residual_um(const Vertices& vertices) const {
+    const PointPairs pairs = PointPairsOf(correspondences_, vertices);
+    return std::round(1e6 * RootMeanSquareResidual(pairs, FitTransform(pairs)));
+  }
+
+  const Correspondences& correspondences_;
+  Vertices last_;
+  double last_residual_ = 0.0;
+};
+
+/// The graph without some of its vertices, which keep their numbers but lose their edges.
+ConsistencyGraph Without(const ConsistencyGraph& graph, const Vertices& removed) {
+  std::vector<bool> is_removed(graph.vertices(), false);
+  for (const std::uint32_t v : removed) is_removed[v] = true;
+  ConsistencyGraph rest;
+  rest.offsets.reserve(graph.offsets.size());
+  rest.neighbours.reserve(graph.neighbours.size());
+  for (std::uint32_t v = 0; v < graph.vertices(); ++v) {
+    if (!is_removed[v]) {
+      for (const std::uint32_t u : graph.Neighbours(v)) {
+        if (!is_removed[u]) rest.neighbours.push_back(u);
+      }
+    }
+    rest.offsets.push_back(rest.neighbours.size());
+  }
+  rest.edges = rest.neighbours.size() / 2;
+  return rest;
+}
+
+std::size_t RunnerUpSize(const ConsistencyGraph& graph, const Vertices& winner, std::chrono::microseconds deadline) {
+  MaxCliqueParameters parameters;
+  parameters.min_size = std::max<std::size_t>(3, (winner.size() + 1) / 2);
+  parameters.deadline = deadline;
+  parameters.max_ties = 1;
+  return FindMaxClique(Without(graph, winner), parameters).vertices.size();
+}
+
+/// Standard deviation per axis of a centroid's error, from the residual of a fit that took six degrees of freedom.
+double CentroidSigma(double rms_m, std::size_t inliers, double min_sigma_m) {
+  const double count = static_cast<double>(inliers);
+  const double degrees_of_freedom = std::max(3.0 * count - 6.0, 1.0);
+  return std::max(min_sigma_m, rms_m * std::sqrt(count / degrees_of_freedom));
+}
+
+void Validate(const RecognizerParameters& parameters) {
+  constexpr double kPi = 3.14159265358979323846;
+  const auto require = [](bool good, const char* message) {
+    if (!good) throw std::invalid_argument(std::string("RecognizerParameters: ") + message);
+  };
+  require(parameters.clique.min_size >= 3, "clique.min_size must be at least 3");
+  require(parameters.clique.deadline.count() > 0, "clique.deadline must be positive");
+  require(parameters.clique.max_ties >= 1, "clique.max_ties must be at least 1");
+  require(parameters.max_tilt_rad >= 0.0 && parameters.max_tilt_rad <= kPi, "max_tilt_rad must be in [0, pi]");
+  require(parameters.consistency.max_vertical_slope >= parameters.max_tilt_rad,
+          "consistency.max_vertical_slope must be at least max_tilt_rad, or pairs of allowed tilts are dropped");
+  require(parameters.max_rms_m > 0.0, "max_rms_m must be positive");
+  require(parameters.min_spread_m > 0.0, "min_spread_m must be positive");
+  require(parameters.min_sigma_m > 0.0, "min_sigma_m must be positive");
+  require(parameters.runner_up_deadline.count() > 0, "runner_up_deadline must be positive");
+}
+
+}  // namespace
+
+Covariance6 TransformCovariance(const std::vector<Eigen::Vector3d>& points_target, double sigma_m) {
+  Eigen::Vector3d centroid = Eigen::Vector3d::Zero();
+  for (const Eigen::Vector3d& p : points_target) centroid += p / static_cast<double>(points_target.size());
+  // A perturbation moves point p by tau + omega x (p - c), c the centroid: J^T J is block diagonal.
+  Eigen::Matrix3d rotation_information = Eigen::Matrix3d::Zero();
+  for (const Eigen::Vector3d& p : points_target) {
+    const Eigen::Vector3d arm = p - centroid;
+    rotation_information += arm.squaredNorm() * Eigen::Matrix3d::Identity() - arm * arm.transpose();
+  }
+  Covariance6 about_centroid = Covariance6::Zero();
+  about_centroid.topLeftCorner<3, 3>() = Eigen::Matrix3d::Identity() / static_cast<double>(points_target.size());
+  about_centroid.bottomRightCorner<3, 3>() = rotation_information.inverse();
+  // The translation of the origin: rho = tau - omega x c = tau + [c]x omega.
+  Covariance6 to_origin = Covariance6::Identity();
+  to_origin.topRightCorner<3, 3>() = CrossMatrix(centroid);
+  const Covariance6 covariance = sigma_m * sigma_m * to_origin * about_centroid * to_origin.transpose();
+  return 0.5 * (covariance + covariance.transpose());
+}
+
+Recognizer::Recognizer(const RecognizerParameters& parameters)
+    : parameters_((Validate(parameters), parameters)), graph_builder_(parameters.consistency) {}
+
+RecognizerResult Recognizer::Recognize(const Correspondences& correspondences) {
+  RecognizerResult result;
+  result.candidates = correspondences.size();
+
+  const Clock::time_point graph_start = Clock::now();
+  const Correspondences sorted = SortedCanonically(correspondences);
+  const ConsistencyGraph graph = graph_builder_.Build(sorted);  // also of few ones: the cache follows them
+  result.edges = graph.edges;
+  result.tested_pairs = graph.tested_pairs;
+  result.graph_ms = MillisecondsSince(graph_start);
+  if (sorted.size() < parameters_.clique.min_size) return result;
+
+  const Clock::time_point clique_start = Clock::now();
+  const MaxCliqueResult clique = FindMaxClique(graph, parameters_.clique, SmallerResidual(sorted));
+  result.clique_size = clique.vertices.size();
+  result.clique_ms = MillisecondsSince(clique_start);
+  result.outcome = RecognitionOutcome::kCliqueTooSmall;
+  if (clique.vertices.empty()) return result;
+
+  const Clock::time_point transform_start = Clock::now();
+  const PointPairs pairs = PointPairsOf(sorted, clique.vertices);
+  Recognition recognition;
+  recognition.T_target_local = FitTransform(pairs);
+  recognition.rms_m = RootMeanSquareResidual(pairs, recognition.T_target_local);
+  recognition.tilt_rad = TiltOf(recognition.T_target_local);
+  recognition.proven_maximum = clique.proven_maximum;
+  recognition.max_inliers = clique.upper_bound;
+  result.transform_ms = MillisecondsSince(transform_start);
+  result.outcome = RecognitionOutcome::kDegenerate;
+  if (std::min(SecondSpread(pairs.local), SecondSpread(pairs.target)) < parameters_.min_spread_m) return result;
+  result.outcome = RecognitionOutcome::kTilted;
+  if (recognition.tilt_rad > parameters_.max_tilt_rad) return result;
+  result.outcome = RecognitionOutcome::kLargeResidual;
+  if (recognition.rms_m > parameters_.max_rms_m) return result;
+
+  std::vector<Eigen::Vector3d> moved;
+  for (const std::uint32_t v : clique.vertices) {
+    recognition.inliers.push_back(sorted[v]);
+    moved.push_back(recognition.T_target_local * sorted[v].centroid_local);
+  }
+  recognition.covariance =
+      TransformCovariance(moved, CentroidSigma(recognition.rms_m, moved.size(), parameters_.min_sigma_m));
+  result.transform_ms = MillisecondsSince(transform_start);
+
+  if (parameters_.find_runner_up) {
+    const Clock::time_point runner_up_start = Clock::now();
+    recognition.runner_up_size = RunnerUpSize(graph, clique.vertices, parameters_.runner_up_deadline);
+    result.clique_ms += MillisecondsSince(runner_up_start);
+  }
+  result.outcome = RecognitionOutcome::kAccepted;
+  result.recognition = std::move(recognition);
+  return result;
+}
+
+}  // namespace incremental_segmatch
