@@ -1,0 +1,397 @@
+#include "back_end_nodelet.hpp"
+
+#include <geometry_msgs/PoseWithCovarianceStamped.h>
+#include <incremental_segmatch/RequestFullState.h>
+
+#include <algorithm>
+#include <boost/make_shared.hpp>
+#include <exception>
+#include <pluginlib/class_list_macros.hpp>
+#include <utility>
+
+#include "markers.hpp"
+
+namespace incremental_segmatch {
+namespace {
+
+constexpr double kWarnPeriod_s = 5.0;
+constexpr double kRequestPeriod_s = 1.0;
+
+const LineStyle kCandidateStyle{"candidates", 0.6f, 0.6f, 0.6f, 0.25f, 0.05};
+const LineStyle kAcceptedStyle{"accepted", 0.1f, 0.9f, 0.2f, 1.0f, 0.25};
+const LineStyle kClosureStyle{"closures", 1.0f, 0.85f, 0.1f, 1.0f, 0.4};
+
+/// Index in the map of a robot of this run: the last of that name, since those of a loaded map come first.
+std::optional<RobotIndex> FindRobot(const TargetMap& map, const std::string& name) {
+  for (std::size_t i = map.robots(); i-- > 0;)
+    if (map.RobotName(static_cast<RobotIndex>(i)) == name) return static_cast<RobotIndex>(i);
+  return std::nullopt;
+}
+
+/// Where a robot was at a stamp of its trajectory, in the map.
+std::optional<Eigen::Vector3d> PositionAt(const TargetMap& map, const std::string& robot, StampNs stamp_ns) {
+  const std::optional<RobotIndex> index = FindRobot(map, robot);
+  if (!index) return std::nullopt;
+  const std::vector<TrajectoryPose>& trajectory = map.Trajectory(*index);
+  const auto pose = std::lower_bound(trajectory.begin(), trajectory.end(), stamp_ns,
+                                     [](const TrajectoryPose& p, StampNs stamp) { return p.stamp_ns < stamp; });
+  if (pose == trajectory.end() || pose->stamp_ns != stamp_ns) return std::nullopt;
+  return pose->T_map_sensor.translation();
+}
+
+}  // namespace
+
+BackEndNodelet::~BackEndNodelet() {
+  diagnostics_timer_.stop();
+  worker_.reset();
+}
+
+void BackEndNodelet::onInit() {
+  try {
+    Start();
+  } catch (const std::exception& error) {
+    NODELET_FATAL("the back end does not start: %s", error.what());
+  }
+}
+
+void BackEndNodelet::Start() {
+  ros::NodeHandle& nh = getNodeHandle();
+  const NodeletParameters<BackEndNodeParameters> parameters = ReadBackEndParameters(getPrivateNodeHandle());
+  parameters_ = parameters.node;
+  core_parameters_ = parameters.core.back_end;
+
+  closures_publisher_ = nh.advertise<LoopClosureMsg>("loop_closures", 100);
+  targets_publisher_ = nh.advertise<sensor_msgs::PointCloud2>("target_segments", 1);
+  candidates_publisher_ = nh.advertise<visualization_msgs::Marker>("candidate_matches", 1);
+  accepted_publisher_ = nh.advertise<visualization_msgs::Marker>("accepted_matches", 1);
+  closure_lines_publisher_ = nh.advertise<visualization_msgs::Marker>("closure_lines", 1, true);
+  steps_publisher_ = nh.advertise<StepReport>("back_end_steps", 10);
+  if (IsLocalization()) {
+    localization_publisher_ = nh.advertise<geometry_msgs::PoseWithCovarianceStamped>("localization", 10);
+    if (parameters_.publish_tf) tf_broadcaster_ = std::make_unique<tf2_ros::TransformBroadcaster>();
+  }
+
+  worker_ = std::make_unique<Worker>(parameters_.queue_size, [this](const std::string& what) { Refuse(what); });
+  worker_->PostAlways([this] {
+    try {
+      StartOver();
+    } catch (const std::exception& error) {
+      back_end_.reset();
+      NODELET_FATAL("the back end does not start: %s", error.what());
+    }
+  });
+  save_service_ = nh.advertiseService("save_map", &BackEndNodelet::OnSaveMap, this);
+  load_service_ = nh.advertiseService("load_map", &BackEndNodelet::OnLoadMap, this);
+  if (parameters_.robots.empty()) Subscribe("");
+  for (const std::string& robot : parameters_.robots) Subscribe(robot);
+
+  diagnostics_ = std::make_unique<diagnostic_updater::Updater>(nh, getPrivateNodeHandle(), getName());
+  diagnostics_->setHardwareID("none");
+  diagnostics_->add("back end", this, &BackEndNodelet::Diagnose);
+  diagnostics_timer_ = nh.createWallTimer(ros::WallDuration(1.0),
+                                          [this](const ros::WallTimerEvent&) { diagnostics_->force_update(); });
+}
+
+void BackEndNodelet::Subscribe(const std::string& robot) {
+  ros::NodeHandle& nh = getNodeHandle();
+  const std::string prefix = robot.empty() ? "" : robot + "/";
+  const std::string topic = nh.resolveName(prefix + "segments");
+  const boost::function<void(const SegmentArrayConstPtr&)> on_segments = [this, topic](const SegmentArrayConstPtr& m) {
+    {
+      const std::lock_guard<std::mutex> lock(mutex_);
+      ++status_.received;
+    }
+    worker_->Post([this, topic, m] { ProcessSegments(*m, topic); });
+  };
+  const boost::function<void(const nav_msgs::PathConstPtr&)> on_path = [this, robot](const nav_msgs::PathConstPtr& m) {
+    worker_->PostAlways([this, robot, m] { CorrectTrajectory(robot, *m); });
+  };
+  subscribers_.push_back(nh.subscribe<SegmentArray>(prefix + "segments", 100, on_segments));
+  subscribers_.push_back(nh.subscribe<nav_msgs::Path>(prefix + "trajectory", 1, on_path));
+}
+
+void BackEndNodelet::StartOver() {
+  if (parameters_.map_file.empty()) {
+    back_end_ = std::make_unique<BackEnd>(core_parameters_);
+  } else {
+    back_end_ = std::make_unique<BackEnd>(core_parameters_,
+                                          TargetMap::Load(parameters_.map_file, core_parameters_.target_map));
+    NODELET_INFO("%zu target segments loaded from %s", back_end_->map().segments().size(),
+                 parameters_.map_file.c_str());
+  }
+  robots_.clear();
+  closures_.clear();
+  if (!parameters_.output_dir.empty())
+    closure_log_ = std::make_unique<ClosureLog>(parameters_.output_dir + "/closures.csv");
+}
+
+bool BackEndNodelet::OnSaveMap(SaveMap::Request& request, SaveMap::Response& response) {
+  try {
+    response.segments = worker_->Run([this, path = request.path] {
+      if (!back_end_) throw std::runtime_error("the back end has not started");
+      back_end_->map().Save(path);
+      return static_cast<std::uint32_t>(back_end_->map().segments().size());
+    });
+    response.success = true;
+    response.message = "saved to " + request.path;
+  } catch (const std::exception& error) {
+    response.success = false;
+    response.message = error.what();
+  }
+  return true;
+}
+
+bool BackEndNodelet::OnLoadMap(LoadMap::Request& request, LoadMap::Response& response) {
+  try {
+    response.segments = worker_->Run([this, path = request.path] {
+      back_end_ = std::make_unique<BackEnd>(core_parameters_, TargetMap::Load(path, core_parameters_.target_map));
+      robots_.clear();
+      closures_.clear();
+      return static_cast<std::uint32_t>(back_end_->map().segments().size());
+    });
+    response.success = true;
+    response.message = "loaded from " + request.path;
+  } catch (const std::exception& error) {
+    response.success = false;
+    response.message = error.what();
+  }
+  return true;
+}
+
+void BackEndNodelet::ProcessSegments(const SegmentArray& message, const std::string& topic) {
+  if (!back_end_) return;
+  const RobotSessions::Session session =
+      sessions_.Find(message.robot, message.session, ToStampNs(message.header.stamp));
+  if (session.change == RobotSessions::Change::kRewound) {
+    NODELET_WARN("time jumped back for %s: the back end forgets all robots and starts over", message.robot.c_str());
+    sessions_.Clear();
+    StartOver();
+    return ProcessSegments(message, topic);
+  }
+  if (session.change == RobotSessions::Change::kRestarted)
+    NODELET_WARN("the front end of %s has started over: it goes on as %s", message.robot.c_str(),
+                 session.name.c_str());
+
+  Robot& robot = Meet(session, message);
+  const SegmentDelta delta = ToSegmentDelta(message, session.name);
+  const BackEndStep step = back_end_->Process(delta);
+  if (step.missed_delta) {
+    {
+      const std::lock_guard<std::mutex> lock(mutex_);
+      ++status_.missed;
+    }
+    return RequestFullState(topic);
+  }
+  Publish(step, delta, robot);
+  Report(step);
+}
+
+BackEndNodelet::Robot& BackEndNodelet::Meet(const RobotSessions::Session& session, const SegmentArray& message) {
+  const auto [it, is_new] = robots_.try_emplace(session.name);
+  Robot& robot = it->second;
+  const Eigen::Vector3d position = ToVector(message.sensor_pose.position);
+  if (!is_new) robot.path_m += (position - robot.position_odom).norm();
+  robot.name = message.robot;
+  robot.frames = ToRobotFrames(message);
+  robot.position_odom = position;
+  return robot;
+}
+
+void BackEndNodelet::RequestFullState(const std::string& topic) {
+  if (!throttle_.IsDue("request " + topic, kRequestPeriod_s)) return;
+  const std::string service = topic + "/request_full_state";
+  incremental_segmatch::RequestFullState request;
+  if (ros::service::call(service, request) && request.response.success)
+    NODELET_INFO("a delta on %s is missing; asked for a full state", topic.c_str());
+  else
+    NODELET_WARN("a delta on %s is missing, and service %s does not answer: no recognition until it does",
+                 topic.c_str(), service.c_str());
+}
+
+void BackEndNodelet::CorrectTrajectory(const std::string& robot_name, const nav_msgs::Path& path) {
+  if (!back_end_ || IsLocalization()) return;
+  for (const auto& [session, robot] : robots_) {
+    if (!robot_name.empty() && robot.name != robot_name) continue;
+    if (robot_name.empty() && robot.name != robots_.begin()->second.name) {
+      if (throttle_.IsDue("trajectory", kWarnPeriod_s))
+        NODELET_WARN("several robots send segments on one topic: whose trajectory is corrected? Set the parameter robots");
+      return;
+    }
+    const std::optional<RobotIndex> index = FindRobot(back_end_->map(), session);
+    if (!index || back_end_->map().Trajectory(*index).empty()) continue;
+    const std::vector<TrajectoryPose>& known = back_end_->map().Trajectory(*index);
+    std::vector<StampedPose> corrected = ToTrajectory(path, parameters_.trajectory_kind, robot.frames);
+    const auto is_other_sessions = [&known](const StampedPose& pose) {
+      return pose.stamp_ns < known.front().stamp_ns || pose.stamp_ns > known.back().stamp_ns;
+    };
+    corrected.erase(std::remove_if(corrected.begin(), corrected.end(), is_other_sessions), corrected.end());
+    if (!corrected.empty()) back_end_->CorrectTrajectory(session, corrected);
+  }
+}
+
+void BackEndNodelet::Publish(const BackEndStep& step, const SegmentDelta& delta, Robot& robot) {
+  if (step.closure) {
+    const LoopClosure& closure = *step.closure;
+    robot.T_map_odom = closure.T_map_odom;
+    closures_.push_back({closure.robot_query, closure.stamp_query_ns, closure.robot_target, closure.stamp_target_ns});
+    if (closure_log_) closure_log_->Add(closure);
+    if (IsLocalization()) {
+      PublishLocalization(closure, delta, robot);
+    } else if (IsDue(closure, robot)) {
+      PublishClosure(closure, robot);
+    }
+  }
+  PublishTransform(delta, robot);
+  PublishMatches(step, delta, robot);
+  PublishMap(ToTime(delta.stamp_ns));
+  if (steps_publisher_.getNumSubscribers() > 0) {
+    std_msgs::Header header;
+    header.stamp = ToTime(delta.stamp_ns);
+    header.frame_id = robot.frames.odom_frame;
+    steps_publisher_.publish(
+        ToStepReport(header, delta.robot, step.times, ToNamedCounts(step.counts), ToString(step.counts.end)));
+  }
+}
+
+bool BackEndNodelet::IsDue(const LoopClosure& closure, const Robot& robot) const {
+  if (!robot.published_path_m) return true;
+  const double interval_s = 1e-9 * static_cast<double>(closure.stamp_query_ns - robot.published_ns);
+  return robot.path_m - *robot.published_path_m >= parameters_.closure_min_distance_m &&
+         interval_s >= parameters_.closure_min_interval_s;
+}
+
+void BackEndNodelet::PublishClosure(const LoopClosure& closure, Robot& robot) {
+  const auto target = robots_.find(closure.robot_target);
+  FrameKind kind = parameters_.closure_kind;
+  RobotFrames target_frames;
+  if (target != robots_.end()) {
+    target_frames = target->second.frames;
+  } else if (kind == FrameKind::kBase) {
+    kind = FrameKind::kSensor;
+    if (throttle_.IsDue("frames " + closure.robot_target, kWarnPeriod_s))
+      NODELET_WARN("the base frame of %s in the loaded map is not known: closures to it are between the sensors",
+                   closure.robot_target.c_str());
+  }
+  robot.published_path_m = robot.path_m;
+  robot.published_ns = closure.stamp_query_ns;
+  closures_publisher_.publish(boost::make_shared<const LoopClosureMsg>(
+      ToLoopClosureMsg(closure, kind, robot.frames, target_frames, back_end_->map())));
+  const std::lock_guard<std::mutex> lock(mutex_);
+  ++status_.published;
+}
+
+void BackEndNodelet::PublishLocalization(const LoopClosure& closure, const SegmentDelta& delta, const Robot& robot) {
+  const Pose T_sensor_base = robot.frames.T_base_sensor.inverse();
+  const Pose T_map_base = closure.T_map_odom * delta.T_odom_sensor * T_sensor_base;
+  const Covariance6 covariance = MoveRightPerturbation(closure.covariance, T_sensor_base);
+  geometry_msgs::PoseWithCovarianceStamped message;
+  message.header.stamp = ToTime(delta.stamp_ns);
+  message.header.frame_id = parameters_.map_frame;
+  message.pose = ToPoseWithCovariance(T_map_base, RightPerturbationToParentAxes(covariance, T_map_base));
+  localization_publisher_.publish(message);
+}
+
+void BackEndNodelet::PublishTransform(const SegmentDelta& delta, const Robot& robot) {
+  if (!tf_broadcaster_ || !robot.T_map_odom) return;
+  const ros::Time stamp = ToTime(delta.stamp_ns) + ros::Duration(parameters_.tf_tolerance_s);
+  tf_broadcaster_->sendTransform(
+      ToTransform(*robot.T_map_odom, parameters_.map_frame, robot.frames.odom_frame, stamp));
+}
+
+void BackEndNodelet::PublishMatches(const BackEndStep& step, const SegmentDelta& delta, const Robot& robot) {
+  std_msgs::Header header;
+  header.stamp = ToTime(delta.stamp_ns);
+  header.frame_id = parameters_.map_frame;
+  const Pose T_map_odom = MapOdom(delta.robot, robot);
+  if (candidates_publisher_.getNumSubscribers() > 0)
+    candidates_publisher_.publish(LineMarker(
+        MatchLines(step.candidates, T_map_odom, parameters_.display_height_m), kCandidateStyle, header));
+  if (accepted_publisher_.getNumSubscribers() > 0) {
+    const std::vector<SegmentMatch> matches = step.closure ? step.closure->matches : std::vector<SegmentMatch>();
+    accepted_publisher_.publish(
+        LineMarker(MatchLines(matches, T_map_odom, parameters_.display_height_m), kAcceptedStyle, header));
+  }
+}
+
+void BackEndNodelet::PublishMap(const ros::Time& stamp) {
+  std_msgs::Header header;
+  header.stamp = stamp;
+  header.frame_id = parameters_.map_frame;
+  if (targets_publisher_.getNumSubscribers() > 0 && throttle_.IsDue("targets", parameters_.display_period_s))
+    targets_publisher_.publish(TargetCloud(back_end_->map(), parameters_.display_height_m, header));
+  if (closure_lines_publisher_.getNumSubscribers() > 0 && throttle_.IsDue("closures", parameters_.display_period_s)) {
+    std::vector<Line> lines;
+    for (const ClosureEnds& ends : closures_) {
+      const auto query = PositionAt(back_end_->map(), ends.robot_query, ends.stamp_query_ns);
+      const auto target = PositionAt(back_end_->map(), ends.robot_target, ends.stamp_target_ns);
+      if (query && target) lines.emplace_back(*query, *target);
+    }
+    closure_lines_publisher_.publish(LineMarker(lines, kClosureStyle, header));
+  }
+}
+
+Pose BackEndNodelet::MapOdom(const std::string& session, const Robot& robot) const {
+  if (IsLocalization()) return robot.T_map_odom.value_or(Pose::Identity());
+  const std::optional<RobotIndex> index = FindRobot(back_end_->map(), session);
+  return index ? back_end_->map().T_map_odom(*index) : Pose::Identity();
+}
+
+void BackEndNodelet::Report(const BackEndStep& step) {
+  const std::size_t memory_bytes = back_end_->memory_bytes();
+  const std::lock_guard<std::mutex> lock(mutex_);
+  ++status_.processed;
+  if (step.closure) ++status_.recognitions;
+  ++status_.ends[ToString(step.counts.end)];
+  status_.counts = step.counts;
+  status_.times = step.times;
+  status_.memory_bytes = memory_bytes;
+}
+
+void BackEndNodelet::Refuse(const std::string& what) {
+  {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    ++status_.refused;
+    status_.last_error = what;
+  }
+  if (throttle_.IsDue("refused", kWarnPeriod_s)) NODELET_ERROR("a message was refused: %s", what.c_str());
+}
+
+void BackEndNodelet::Diagnose(diagnostic_updater::DiagnosticStatusWrapper& status) {
+  using diagnostic_msgs::DiagnosticStatus;
+  const std::lock_guard<std::mutex> lock(mutex_);
+  const Clock::time_point now = Clock::now();
+  const double elapsed_s = std::chrono::duration<double>(now - status_.reported).count();
+  const double rate_hz = static_cast<double>(status_.processed - status_.reported_processed) / elapsed_s;
+
+  if (status_.refused != status_.reported_refused)
+    status.summary(DiagnosticStatus::ERROR, "a message was refused: " + status_.last_error);
+  else if (status_.received == status_.reported_received)
+    status.summary(DiagnosticStatus::OK, "waiting for segments on " + subscribers_.front().getTopic());
+  else if (status_.processed == status_.reported_processed)
+    status.summary(DiagnosticStatus::WARN, "segments come, but none could be applied: waiting for a full state");
+  else
+    status.summaryf(DiagnosticStatus::OK, "%.1f steps/s, %zu recognitions so far", rate_hz, status_.recognitions);
+
+  status.add("segment arrays received", status_.received);
+  status.add("segment arrays applied", status_.processed);
+  status.addf("steps per second", "%.1f", rate_hz);
+  status.add("segment arrays waiting", worker_->queued());
+  status.add("segment arrays dropped by the full queue", worker_->dropped());
+  status.add("segment arrays after a gap", status_.missed);
+  status.add("messages refused", status_.refused);
+  status.add("recognitions", status_.recognitions);
+  status.add("loop closures published", status_.published);
+  for (const auto& [end, count] : status_.ends) status.add("steps that ended: " + end, count);
+  for (const auto& [name, value] : ToNamedCounts(status_.counts)) status.add(name, value);
+  for (const auto& [stage, milliseconds] : status_.times) status.addf(stage + " [ms]", "%.2f", milliseconds);
+  status.addf("memory [MB]", "%.1f", 1e-6 * static_cast<double>(status_.memory_bytes));
+
+  status_.reported = now;
+  status_.reported_received = status_.received;
+  status_.reported_processed = status_.processed;
+  status_.reported_refused = status_.refused;
+}
+
+}  // namespace incremental_segmatch
+
+PLUGINLIB_EXPORT_CLASS(incremental_segmatch::BackEndNodelet, nodelet::Nodelet)

@@ -1,0 +1,138 @@
+/// \file
+/// Map side as a nodelet: segments of any number of robots in, loop closures or localizations out.
+#pragma once
+
+#include <diagnostic_updater/diagnostic_updater.h>
+#include <incremental_segmatch/LoadMap.h>
+#include <incremental_segmatch/SaveMap.h>
+#include <nav_msgs/Path.h>
+#include <nodelet/nodelet.h>
+#include <ros/ros.h>
+#include <tf2_ros/transform_broadcaster.h>
+
+#include <chrono>
+#include <map>
+#include <memory>
+#include <mutex>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "closure_log.hpp"
+#include "conversions.hpp"
+#include "incremental_segmatch/back_end.hpp"
+#include "node_parameters.hpp"
+#include "robot_sessions.hpp"
+#include "throttle.hpp"
+#include "worker.hpp"
+
+namespace incremental_segmatch {
+
+/// The BackEnd of all robots. Callbacks only queue; the worker's thread owns the BackEnd and publishes. A delta that is missing
+/// makes it ask the robot's front end for a full state. A wrong parameter is FATAL, and the nodelet then stays idle.
+///
+/// Subscribes `segments` and `trajectory`, or `<robot>/segments` and `<robot>/trajectory`. Publishes `loop_closures`;
+/// `localization` and tf (in localization); `target_segments`, `candidate_matches`, `accepted_matches`, `closure_lines` for
+/// rviz; `back_end_steps`; diagnostics. Serves `save_map`, `load_map`.
+class BackEndNodelet : public nodelet::Nodelet {
+ public:
+  ~BackEndNodelet() override;
+
+ private:
+  using Clock = std::chrono::steady_clock;
+
+  /// A session of a robot. Owned by the worker's thread.
+  struct Robot {
+    std::string name;                   ///< of the robot; the session's own name is the key
+    RobotFrames frames;
+    std::optional<Pose> T_map_odom;     ///< of the last recognition
+    Eigen::Vector3d position_odom = Eigen::Vector3d::Zero();
+    double path_m = 0.0;
+    std::optional<double> published_path_m;  ///< at the last published closure
+    StampNs published_ns = 0;
+  };
+
+  /// The two poses of an accepted recognition.
+  struct ClosureEnds {
+    std::string robot_query;
+    StampNs stamp_query_ns;
+    std::string robot_target;
+    StampNs stamp_target_ns;
+  };
+
+  /// What diagnostics tell; guarded by mutex_.
+  struct Status {
+    std::size_t received = 0;
+    std::size_t processed = 0;
+    std::size_t missed = 0;
+    std::size_t refused = 0;
+    std::size_t recognitions = 0;
+    std::size_t published = 0;
+    std::string last_error;
+    std::map<std::string, std::size_t> ends;
+    BackEndCounts counts;
+    StageTimes times;
+    std::size_t memory_bytes = 0;
+    std::size_t reported_received = 0;  ///< at the last report, as the next two
+    std::size_t reported_processed = 0;
+    std::size_t reported_refused = 0;
+    Clock::time_point reported = Clock::now();
+  };
+
+  void onInit() override;
+  void Start();
+  void Subscribe(const std::string& robot);
+  bool OnSaveMap(SaveMap::Request& request, SaveMap::Response& response);
+  bool OnLoadMap(LoadMap::Request& request, LoadMap::Response& response);
+  void Diagnose(diagnostic_updater::DiagnosticStatusWrapper& status);
+
+  // In the worker's thread.
+  void StartOver();
+  void ProcessSegments(const SegmentArray& message, const std::string& topic);
+  Robot& Meet(const RobotSessions::Session& session, const SegmentArray& message);
+  void RequestFullState(const std::string& topic);
+  void CorrectTrajectory(const std::string& robot, const nav_msgs::Path& path);
+  void Publish(const BackEndStep& step, const SegmentDelta& delta, Robot& robot);
+  bool IsDue(const LoopClosure& closure, const Robot& robot) const;
+  void PublishClosure(const LoopClosure& closure, Robot& robot);
+  void PublishLocalization(const LoopClosure& closure, const SegmentDelta& delta, const Robot& robot);
+  void PublishTransform(const SegmentDelta& delta, const Robot& robot);
+  void PublishMatches(const BackEndStep& step, const SegmentDelta& delta, const Robot& robot);
+  void PublishMap(const ros::Time& stamp);
+  Pose MapOdom(const std::string& session, const Robot& robot) const;
+  void Report(const BackEndStep& step);
+  void Refuse(const std::string& what);
+  bool IsLocalization() const { return core_parameters_.mode == Mode::kLocalization; }
+
+  BackEndNodeParameters parameters_;
+  BackEndParameters core_parameters_;
+  Throttle throttle_;
+
+  std::vector<ros::Subscriber> subscribers_;
+  ros::Publisher closures_publisher_;
+  ros::Publisher localization_publisher_;
+  ros::Publisher targets_publisher_;
+  ros::Publisher candidates_publisher_;
+  ros::Publisher accepted_publisher_;
+  ros::Publisher closure_lines_publisher_;
+  ros::Publisher steps_publisher_;
+  ros::ServiceServer save_service_;
+  ros::ServiceServer load_service_;
+  ros::WallTimer diagnostics_timer_;
+  std::unique_ptr<diagnostic_updater::Updater> diagnostics_;
+  std::unique_ptr<tf2_ros::TransformBroadcaster> tf_broadcaster_;
+
+  std::mutex mutex_;
+  Status status_;
+
+  // Owned by the worker's thread.
+  std::unique_ptr<BackEnd> back_end_;
+  std::unique_ptr<ClosureLog> closure_log_;
+  RobotSessions sessions_;
+  std::map<std::string, Robot> robots_;  // by session
+  std::vector<ClosureEnds> closures_;
+
+  std::unique_ptr<Worker> worker_;  // last: its thread ends before anything else goes
+};
+
+}  // namespace incremental_segmatch

@@ -1,0 +1,281 @@
+#include "front_end_nodelet.hpp"
+
+#include <pluginlib/class_list_macros.hpp>
+
+#include <algorithm>
+#include <boost/make_shared.hpp>
+#include <cmath>
+#include <exception>
+#include <utility>
+
+#include "point_cloud.hpp"
+
+namespace incremental_segmatch {
+namespace {
+
+constexpr double kPollPeriod_s = 0.005;
+constexpr double kWarnPeriod_s = 5.0;
+constexpr StampNs kJumpBackNs = 1'000'000'000;    // stamps that go back by less are late messages, by more a new run
+constexpr StampNs kSameStampNs = 1'000'000;       // stacks pass stamps through doubles
+constexpr std::size_t kHistorySize = 600;
+constexpr double kQuantisation = 0.1;             // of segment points, in voxels
+constexpr double kCoarseFloatDistance_m = 10e3;   // from here on, registered float clouds are coarser than a millimetre
+
+bool HasFinitePoint(const Points& points) {
+  return std::any_of(points.begin(), points.end(), [](const Eigen::Vector3f& p) { return p.allFinite(); });
+}
+
+}  // namespace
+
+FrontEndNodelet::~FrontEndNodelet() {
+  diagnostics_timer_.stop();
+  worker_.reset();
+}
+
+void FrontEndNodelet::onInit() {
+  try {
+    Start();
+  } catch (const std::exception& error) {
+    NODELET_FATAL("the front end does not start: %s", error.what());
+  }
+}
+
+void FrontEndNodelet::Start() {
+  ros::NodeHandle& nh = getNodeHandle();
+  const NodeletParameters<FrontEndNodeParameters> parameters = ReadFrontEndParameters(getPrivateNodeHandle());
+  parameters_ = parameters.node;
+  core_parameters_ = parameters.core.front_end;
+  front_end_ = std::make_unique<FrontEnd>(core_parameters_, parameters_.robot);
+  session_ = ros::WallTime::now().toNSec();
+  locator_ = std::make_unique<SensorLocator>(parameters_);
+  worker_ = std::make_unique<Worker>(parameters_.queue_size,
+                                     [this](const std::string& what) { Skip("internal error", what); });
+
+  segments_publisher_ = nh.advertise<SegmentArray>("segments", 10);
+  local_cloud_publisher_ = nh.advertise<sensor_msgs::PointCloud2>("local_cloud", 1);
+  steps_publisher_ = nh.advertise<StepReport>("front_end_steps", 10);
+  full_state_service_ = nh.advertiseService(segments_publisher_.getTopic() + "/request_full_state",
+                                            &FrontEndNodelet::OnRequestFullState, this);
+  if (parameters_.pose_source == PoseSource::kOdometry)
+    odometry_subscriber_ = nh.subscribe("odometry", 200, &FrontEndNodelet::OnOdometry, this);
+  if (parameters_.frame_jumps)
+    trajectory_subscriber_ = nh.subscribe("trajectory", 1, &FrontEndNodelet::OnTrajectory, this);
+  cloud_subscriber_ = nh.subscribe("points", static_cast<std::uint32_t>(parameters_.queue_size),
+                                   &FrontEndNodelet::OnCloud, this);
+
+  diagnostics_ = std::make_unique<diagnostic_updater::Updater>(nh, getPrivateNodeHandle(), getName());
+  diagnostics_->setHardwareID("none");
+  diagnostics_->add("front end", this, &FrontEndNodelet::Diagnose);
+  diagnostics_timer_ = nh.createWallTimer(ros::WallDuration(1.0),
+                                          [this](const ros::WallTimerEvent&) { diagnostics_->force_update(); });
+  NODELET_INFO("front end of %s: clouds from %s, poses from %s", parameters_.robot.c_str(),
+               cloud_subscriber_.getTopic().c_str(),
+               parameters_.pose_source == PoseSource::kTf ? "tf" : odometry_subscriber_.getTopic().c_str());
+}
+
+void FrontEndNodelet::OnCloud(const sensor_msgs::PointCloud2ConstPtr& cloud) {
+  {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    ++status_.received;
+  }
+  worker_->Post([this, cloud, received = Clock::now()] { ProcessCloud(*cloud, received); });
+}
+
+void FrontEndNodelet::OnOdometry(const nav_msgs::OdometryConstPtr& odometry) {
+  try {
+    locator_->AddOdometry(*odometry);
+  } catch (const std::invalid_argument& error) {
+    if (throttle_.IsDue("odometry", kWarnPeriod_s)) NODELET_WARN("an odometry message is left out: %s", error.what());
+  }
+}
+
+void FrontEndNodelet::OnTrajectory(const nav_msgs::PathConstPtr& path) {
+  worker_->PostAlways([this, path] { FollowJump(*path); });
+}
+
+bool FrontEndNodelet::OnRequestFullState(RequestFullState::Request& /*request*/,
+                                         RequestFullState::Response& response) {
+  worker_->PostAlways([this] { full_state_wanted_ = true; });
+  response.success = true;
+  response.message = "the next delta is a full state";
+  return true;
+}
+
+void FrontEndNodelet::ProcessCloud(const sensor_msgs::PointCloud2& cloud, Clock::time_point received) {
+  if (std::size_t{cloud.width} * cloud.height == 0) return Skip("empty", "the cloud is empty");
+  if (!AcceptStamp(cloud)) return;
+  const std::optional<SensorLocation> location = WaitForLocation(cloud, received);
+  if (!location) return;
+  Scan scan;
+  scan.stamp_ns = ToStampNs(cloud.header.stamp);
+  scan.T_odom_sensor = location->T_odom_sensor;
+  try {
+    scan.points_sensor = ReadScanPoints(cloud, *location);
+    if (!HasFinitePoint(scan.points_sensor))
+      return Skip("no finite point", "none of the cloud's " + std::to_string(scan.points_sensor.size()) +
+                                         " points is finite");
+    FrontEndStep step = front_end_->Process(scan);
+    history_.push_back({scan.stamp_ns, scan.T_odom_sensor});
+    if (history_.size() > kHistorySize) history_.pop_front();
+    frames_ = location->frames;
+    Publish(std::move(step), *location);
+  } catch (const std::invalid_argument& error) {
+    Skip("unusable", error.what());
+  }
+}
+
+bool FrontEndNodelet::AcceptStamp(const sensor_msgs::PointCloud2& cloud) {
+  if (cloud.header.stamp.isZero()) {
+    Skip("no stamp", "the cloud's stamp is 0; it has to be the time of the scan");
+    return false;
+  }
+  const StampNs stamp_ns = ToStampNs(cloud.header.stamp);
+  if (last_stamp_ns_ && stamp_ns <= *last_stamp_ns_) {
+    if (*last_stamp_ns_ - stamp_ns < kJumpBackNs) {
+      Skip("out of order", "the cloud is not newer than the last one");
+      return false;
+    }
+    NODELET_WARN("time jumped back by %.1f s (a bag that starts again?): the front end of %s starts over",
+                 1e-9 * static_cast<double>(*last_stamp_ns_ - stamp_ns), parameters_.robot.c_str());
+    Restart();
+  }
+  last_stamp_ns_ = stamp_ns;
+  return true;
+}
+
+void FrontEndNodelet::Restart() {
+  front_end_ = std::make_unique<FrontEnd>(core_parameters_, parameters_.robot);
+  session_ = std::max(ros::WallTime::now().toNSec(), session_ + 1);
+  locator_->Clear();
+  history_.clear();
+  const std::lock_guard<std::mutex> lock(mutex_);
+  ++status_.restarts;
+}
+
+std::optional<SensorLocation> FrontEndNodelet::WaitForLocation(const sensor_msgs::PointCloud2& cloud,
+                                                               Clock::time_point received) {
+  const std::string cloud_frame = FrameName(cloud.header.frame_id);
+  const std::string odom_frame = FrameName(parameters_.odom_frame);
+  if (parameters_.registered && cloud_frame != odom_frame) {
+    Skip("wrong frame", "registered clouds come in frame " + cloud_frame + ", but odom_frame is " + odom_frame);
+    return std::nullopt;
+  }
+  const std::string sensor_frame = parameters_.sensor_frame.empty() ? cloud_frame : FrameName(parameters_.sensor_frame);
+  if (sensor_frame.empty()) {
+    Skip("no frame", "the cloud has no frame_id, and sensor_frame is not set");
+    return std::nullopt;
+  }
+  const auto deadline = received + std::chrono::duration<double>(parameters_.pose_timeout_s);
+  while (true) {
+    LocateResult result = locator_->Locate(cloud.header.stamp, sensor_frame);
+    if (result.location) return result.location;
+    if (worker_->stopping()) return std::nullopt;
+    if (Clock::now() >= deadline) {
+      Skip("no pose", result.reason);
+      return std::nullopt;
+    }
+    worker_->SleepFor(kPollPeriod_s);
+  }
+}
+
+Points FrontEndNodelet::ReadScanPoints(const sensor_msgs::PointCloud2& cloud, const SensorLocation& location) const {
+  return parameters_.registered ? ReadPoints(cloud, location.T_odom_sensor.inverse()) : ReadPoints(cloud);
+}
+
+void FrontEndNodelet::FollowJump(const nav_msgs::Path& path) {
+  const std::vector<StampedPose> trajectory = ToTrajectory(path, parameters_.trajectory_kind, frames_);
+  for (auto corrected = trajectory.rbegin(); corrected != trajectory.rend(); ++corrected) {
+    const auto used = std::find_if(history_.rbegin(), history_.rend(), [&corrected](const StampedPose& pose) {
+      return std::abs(pose.stamp_ns - corrected->stamp_ns) < kSameStampNs;
+    });
+    if (used == history_.rend()) continue;
+    const Pose T_new_old = corrected->T_frame_sensor * used->T_frame_sensor.inverse();
+    if (T_new_old.isApprox(Pose::Identity(), 1e-6)) return;
+    front_end_->ApplyJump(T_new_old);
+    for (StampedPose& pose : history_) pose.T_frame_sensor = T_new_old * pose.T_frame_sensor;
+    return;
+  }
+}
+
+void FrontEndNodelet::Skip(const std::string& kind, const std::string& reason) {
+  std::size_t count = 0;
+  {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    count = ++status_.skipped[kind];
+    status_.last_skip = reason;
+  }
+  if (throttle_.IsDue(kind, kWarnPeriod_s)) NODELET_WARN("%zu scans skipped so far: %s", count, reason.c_str());
+}
+
+void FrontEndNodelet::Publish(FrontEndStep step, const SensorLocation& location) {
+  std_msgs::Header header;
+  header.stamp = ToTime(step.delta.stamp_ns);
+  header.frame_id = location.frames.odom_frame;
+  if (segments_publisher_.getNumSubscribers() > 0) {
+    const SegmentDelta delta = full_state_wanted_ ? front_end_->FullState() : std::move(step.delta);
+    full_state_wanted_ = false;
+    segments_publisher_.publish(boost::make_shared<const SegmentArray>(
+        ToSegmentArray(delta, location.frames, session_, kQuantisation * core_parameters_.grid.resolution_m,
+                       parameters_.send_points)));
+  }
+  if (local_cloud_publisher_.getNumSubscribers() > 0) PublishLocalCloud(header);
+  if (steps_publisher_.getNumSubscribers() > 0)
+    steps_publisher_.publish(ToStepReport(header, parameters_.robot, step.times, ToNamedCounts(step.counts), ""));
+
+  const std::lock_guard<std::mutex> lock(mutex_);
+  ++status_.processed;
+  status_.counts = step.counts;
+  status_.times = step.times;
+  status_.memory_bytes = front_end_->memory_bytes();
+  status_.distance_m = location.T_odom_sensor.translation().norm();
+}
+
+void FrontEndNodelet::PublishLocalCloud(const std_msgs::Header& header) {
+  std::vector<ColouredPoint> points;
+  for (const LocalPoint& point : front_end_->LocalCloud())
+    points.push_back({point.position_odom, SegmentColour({0, point.segment})});
+  local_cloud_publisher_.publish(boost::make_shared<const sensor_msgs::PointCloud2>(ToPointCloud2(points, header)));
+}
+
+void FrontEndNodelet::Diagnose(diagnostic_updater::DiagnosticStatusWrapper& status) {
+  using diagnostic_msgs::DiagnosticStatus;
+  const std::lock_guard<std::mutex> lock(mutex_);
+  const Clock::time_point now = Clock::now();
+  const double elapsed_s = std::chrono::duration<double>(now - status_.reported).count();
+  std::size_t skipped = 0;
+  for (const auto& [kind, count] : status_.skipped) skipped += count;
+  const double rate_hz = static_cast<double>(status_.processed - status_.reported_processed) / elapsed_s;
+
+  if (ros::Time::isSimTime() && ros::Time::now().isZero())
+    status.summary(DiagnosticStatus::WARN, "use_sim_time is set, but nothing publishes /clock");
+  else if (cloud_subscriber_.getNumPublishers() == 0 && status_.received == status_.reported_received)
+    status.summary(DiagnosticStatus::WARN, "nobody publishes " + cloud_subscriber_.getTopic());
+  else if (skipped != status_.reported_skipped)
+    status.summary(DiagnosticStatus::WARN, "scans are skipped: " + status_.last_skip);
+  else if (parameters_.registered && status_.distance_m > kCoarseFloatDistance_m)
+    status.summary(DiagnosticStatus::WARN, "so far from the origin, registered float clouds are coarse: publish doubles");
+  else if (status_.received == status_.reported_received)
+    status.summary(DiagnosticStatus::OK, "waiting for clouds on " + cloud_subscriber_.getTopic());
+  else
+    status.summaryf(DiagnosticStatus::OK, "%.1f scans/s", rate_hz);
+
+  status.add("scans received", status_.received);
+  status.add("scans processed", status_.processed);
+  status.addf("scans per second", "%.1f", rate_hz);
+  status.add("scans waiting", worker_->queued());
+  status.add("scans dropped by the full queue", worker_->dropped());
+  for (const auto& [kind, count] : status_.skipped) status.add("scans skipped: " + kind, count);
+  status.add("starts over", status_.restarts);
+  for (const auto& [name, value] : ToNamedCounts(status_.counts)) status.add(name, value);
+  for (const auto& [stage, milliseconds] : status_.times) status.addf(stage + " [ms]", "%.2f", milliseconds);
+  status.addf("memory [MB]", "%.1f", 1e-6 * static_cast<double>(status_.memory_bytes));
+
+  status_.reported = now;
+  status_.reported_received = status_.received;
+  status_.reported_processed = status_.processed;
+  status_.reported_skipped = skipped;
+}
+
+}  // namespace incremental_segmatch
+
+PLUGINLIB_EXPORT_CLASS(incremental_segmatch::FrontEndNodelet, nodelet::Nodelet)
