@@ -19,8 +19,7 @@ jobs=$((jobs < 1 ? 1 : jobs))
 
 # Make configures anew by itself when a CMake file has changed.
 if [[ $# -gt 0 || ! -f $root/build/Makefile ]]; then
-  cmake -S "$root" -B "$root/build" -G "Unix Makefiles" -DCATKIN_DEVEL_PREFIX="$root/devel" \
-    -DPYTHON_EXECUTABLE=/usr/bin/python3 "$@"
+  cmake -S "$root" -B "$root/build" -G "Unix Makefiles" -DCATKIN_DEVEL_PREFIX="$root/devel" "$@"
 fi
 cmake --build "$root/build" --parallel "$jobs"
 # The ROS tests' programs are no part of catkin's target `all`.

@@ -9,7 +9,7 @@ Usage: install_dependencies.sh [--benchmark] [--docs] [--pictures] [--tools] [--
 Installs the packages that are missing for building, the tests, the demo and rviz. Needs root or sudo only where
 something is missing. Recommended packages are not installed.
 
-  --benchmark  also for the benchmarks (google-benchmark, PCL)
+  --benchmark  also for the benchmarks (google-benchmark)
   --docs       also for the target `docs` (Doxygen)
   --pictures   also for pictures of rviz without a display (Xvfb, ImageMagick)
   --tools      also clang-format and clang-tidy
@@ -39,7 +39,7 @@ fi
 
 packages=(
   build-essential cmake pkg-config python3
-  libceres-dev libcli11-dev libeigen3-dev libflann-dev libgtest-dev libyaml-cpp-dev nlohmann-json3-dev
+  libceres-dev libcli11-dev libeigen3-dev libflann-dev libgtest-dev libpcl-dev libyaml-cpp-dev nlohmann-json3-dev
 )
 case "$system" in
   debian-12)
@@ -68,7 +68,7 @@ case "$system" in
 install_dependencies.sh: this system ($system) is none that the script knows (Debian 12; Ubuntu 20.04, untried).
 Install these yourself, then run cmake:
   a C++17 compiler, CMake 3.16, pkg-config, Python 3
-  Eigen 3.3, yaml-cpp, FLANN, Ceres Solver 2.1, CLI11, nlohmann-json, GoogleTest
+  Eigen 3.3, yaml-cpp, FLANN, PCL 1.10, Ceres Solver 2.1, CLI11, nlohmann-json, GoogleTest
   for the nodelets and bags, ROS 1: catkin, roscpp, nodelet, pluginlib, rosbag, tf2, tf2_ros, tf2_eigen, tf2_msgs,
   diagnostic_updater, dynamic_reconfigure, message_generation, std_msgs, std_srvs, geometry_msgs, nav_msgs,
   sensor_msgs, visualization_msgs, diagnostic_msgs, rostest, roslaunch, rviz
@@ -76,7 +76,7 @@ MESSAGE
     exit 1
     ;;
 esac
-if $benchmark; then packages+=(libbenchmark-dev libpcl-dev); fi
+if $benchmark; then packages+=(libbenchmark-dev); fi
 if $docs; then packages+=(doxygen graphviz); fi
 if $pictures; then packages+=(imagemagick libgl1-mesa-dri xvfb); fi
 if $tools; then packages+=(clang-format clang-tidy); fi
