@@ -1,0 +1,168 @@
+// The program as a user calls it: exit statuses, messages and the files that it writes.
+#include <gtest/gtest.h>
+#include <sys/wait.h>
+
+#include <algorithm>
+#include <cstdio>
+#include <filesystem>
+#include <fstream>
+#include <nlohmann/json.hpp>
+#include <sstream>
+#include <string>
+#include <vector>
+
+#include "support/kitti_layout.hpp"
+#include "support/temporary_directory.hpp"
+
+namespace incremental_segmatch {
+namespace {
+
+#define EXPECT_HAS(text, word) \
+  EXPECT_NE((text).find(word), std::string::npos) << "`" << (word) << "` is not in: " << (text)
+
+struct Run {
+  int status = -1;
+  std::string output;  // of both streams
+};
+
+Run Segmatch(const std::string& arguments) {
+  Run run;
+  FILE* pipe = popen((std::string(SEGMATCH_PROGRAM) + " " + arguments + " 2>&1").c_str(), "r");
+  if (pipe == nullptr) return run;
+  char buffer[4096];
+  while (const std::size_t bytes = std::fread(buffer, 1, sizeof buffer, pipe)) run.output.append(buffer, bytes);
+  const int status = pclose(pipe);
+  run.status = WIFEXITED(status) ? WEXITSTATUS(status) : -1;
+  return run;
+}
+
+std::vector<std::string> Lines(const std::string& path) {
+  std::ifstream file(path);
+  std::vector<std::string> lines;
+  for (std::string line; std::getline(file, line);) lines.push_back(line);
+  return lines;
+}
+
+TEST(Program, HelpTeachesWithExamples) {
+  const Run run = Segmatch("--help");
+  EXPECT_EQ(run.status, 0);
+  for (const std::string command : {"simulate", "kitti2bag", "evaluate"}) {
+    EXPECT_HAS(run.output, command);
+    const Run help = Segmatch(command + " --help");
+    EXPECT_EQ(help.status, 0);
+    EXPECT_HAS(help.output, "  segmatch " + command + " --");
+  }
+  EXPECT_EQ(Segmatch("--version").status, 0);
+}
+
+TEST(Program, WrongCallsAreRefused) {
+  EXPECT_NE(Segmatch("").status, 0);
+  EXPECT_NE(Segmatch("dance").status, 0);
+  const Run nothing = Segmatch("evaluate --out x");
+  EXPECT_NE(nothing.status, 0);
+  EXPECT_HAS(nothing.output, "--kitti");
+  const Run no_sequence = Segmatch("evaluate --kitti x --out x");
+  EXPECT_NE(no_sequence.status, 0);
+  EXPECT_HAS(no_sequence.output, "--sequence");
+  const Run both = Segmatch("evaluate --kitti x --sequence 00 --bag y --out x");
+  EXPECT_NE(both.status, 0);
+}
+
+class Drive : public testing::Test {
+ protected:
+  Drive() { test::WriteKittiLayout(test::MakeTinyDrive(6), directory_, "07"); }
+  std::string Kitti() const { return "--kitti " + directory_.path() + " --sequence 07"; }
+  std::string Out(const std::string& name) const { return directory_.path() + "/" + name; }
+
+  test::TemporaryDirectory directory_;
+};
+
+TEST_F(Drive, MissingDataIsNamed) {
+  const Run run = Segmatch("evaluate --kitti /nonexistent --sequence 00 --out " + Out("result"));
+  EXPECT_EQ(run.status, 1);
+  EXPECT_HAS(run.output, "segmatch: /nonexistent/sequences/00/velodyne is no folder");
+}
+
+TEST_F(Drive, UnknownParameterIsNamed) {
+  const std::string config = directory_.Write("config.yaml", "front_end:\n  no_such_key: 1\n");
+  const Run run = Segmatch("evaluate " + Kitti() + " --config " + config + " --out " + Out("result"));
+  EXPECT_EQ(run.status, 1);
+  EXPECT_HAS(run.output, "front_end.no_such_key");
+}
+
+TEST_F(Drive, EvaluateWritesItsFiles) {
+  const Run run = Segmatch("evaluate " + Kitti() + " --odometry odometry.txt --max-steps 5 --out " + Out("a/result"));
+  ASSERT_EQ(run.status, 0) << run.output;
+  EXPECT_HAS(run.output, "5 steps");
+  EXPECT_HAS(run.output, "trajectory error");
+  EXPECT_HAS(run.output, "bound");
+  const std::vector<std::string> closures = Lines(Out("a/result/closures.csv"));
+  ASSERT_EQ(closures.size(), 1u) << "nothing is revisited";
+  EXPECT_EQ(closures[0],
+            "stamp_query,stamp_target,robot_query,robot_target,x,y,z,qx,qy,qz,qw,inliers,candidates,rms_m");
+  const std::vector<std::string> steps = Lines(Out("a/result/steps.csv"));
+  ASSERT_EQ(steps.size(), 6u);
+  for (const std::string column : {"total_ms", "points", "voxels", "segments", "candidates", "edges", "clique"}) {
+    EXPECT_HAS("," + steps[0] + ",", "," + column + ",");
+  }
+  EXPECT_HAS(steps[2], "1,0.100000000,");
+  for (const std::string& row : steps) {
+    EXPECT_EQ(std::count(row.begin(), row.end(), ','), std::count(steps[0].begin(), steps[0].end(), ','));
+  }
+  EXPECT_EQ(Lines(Out("a/result/trajectory_odometry.tum")).size(), 5u);
+  EXPECT_EQ(Lines(Out("a/result/trajectory_optimized.tum")).size(), 5u);
+  std::ifstream file(Out("a/result/summary.json"));
+  const nlohmann::json summary = nlohmann::json::parse(file);
+  EXPECT_EQ(summary["steps"], 5);
+  EXPECT_EQ(summary["odometry_is_truth"], false);
+  EXPECT_EQ(summary["counts"]["points"]["median"], 4);
+  EXPECT_TRUE(summary["score"]["recall"].is_null()) << "there is no revisit to find";
+  EXPECT_GT(summary["trajectory_error_m"]["odometry"], 0.0);
+  EXPECT_TRUE(summary["stages_ms"].contains("total"));
+  // The parameters that were used reproduce the run.
+  EXPECT_EQ(
+      Segmatch("evaluate " + Kitti() + " --config " + Out("a/result/parameters.yaml") + " --out " + Out("b")).status,
+      0);
+}
+
+TEST_F(Drive, TheOdometryUsedIsSaid) {
+  const Run run = Segmatch("evaluate " + Kitti() + " --out " + Out("result"));
+  ASSERT_EQ(run.status, 0) << run.output;
+  EXPECT_HAS(run.output, "does not drift");
+  std::ifstream file(Out("result/summary.json"));
+  EXPECT_EQ(nlohmann::json::parse(file)["odometry_is_truth"], true);
+}
+
+TEST_F(Drive, Bags) {
+  const Run written = Segmatch("kitti2bag " + Kitti() + " --out " + Out("drive.bag"));
+#ifdef SEGMATCH_WITH_ROSBAG
+  ASSERT_EQ(written.status, 0) << written.output;
+  EXPECT_HAS(written.output, "odometry.txt");
+  const Run from_bag = Segmatch("evaluate --bag " + Out("drive.bag") + " --out " + Out("bag"));
+  ASSERT_EQ(from_bag.status, 0) << from_bag.output;
+  const Run from_files = Segmatch("evaluate " + Kitti() + " --odometry odometry.txt --out " + Out("files"));
+  ASSERT_EQ(from_files.status, 0) << from_files.output;
+  std::ifstream bag(Out("bag/summary.json")), files(Out("files/summary.json"));
+  const nlohmann::json a = nlohmann::json::parse(bag), b = nlohmann::json::parse(files);
+  EXPECT_EQ(a["steps"], b["steps"]);
+  EXPECT_NEAR(a["trajectory_error_m"]["odometry"], b["trajectory_error_m"]["odometry"], 1e-6);
+  EXPECT_HAS(Lines(Out("bag/steps.csv"))[2], "1,0.100000000,");
+  std::filesystem::remove(directory_.path() + "/sequences/07/odometry.txt");
+  EXPECT_HAS(Segmatch("kitti2bag " + Kitti() + " --out " + Out("other.bag")).output, "poses serve as odometry");
+#else
+  EXPECT_EQ(written.status, 1);
+  EXPECT_HAS(written.output, "not built in");
+  const Run run = Segmatch("evaluate --bag x.bag --out " + Out("result"));
+  EXPECT_EQ(run.status, 1);
+  EXPECT_HAS(run.output, "--bag is not built in");
+#endif
+}
+
+TEST_F(Drive, SimulatedOnTheFly) {
+  const Run run = Segmatch("evaluate --simulate --sensor VLP-16 --route lap --max-steps 8 --out " + Out("result"));
+  ASSERT_EQ(run.status, 0) << run.output;
+  EXPECT_HAS(run.output, "8 steps of simulated drive along route lap");
+}
+
+}  // namespace
+}  // namespace incremental_segmatch
