@@ -4,6 +4,7 @@
 
 #include "apps/evaluate.hpp"
 #include "apps/kitti2bag.hpp"
+#include "apps/score.hpp"
 #include "apps/simulate.hpp"
 
 int main(int argc, char** argv) {
@@ -27,6 +28,7 @@ int main(int argc, char** argv) {
   AddSimulateCommand(app);
   AddKitti2BagCommand(app);
   AddEvaluateCommand(app);
+  AddScoreCommand(app);
   try {
     app.parse(argc, argv);
   } catch (const CLI::ParseError& error) {

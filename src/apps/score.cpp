@@ -1,0 +1,80 @@
+#include "apps/score.hpp"
+
+#include <cstdint>
+#include <cstdio>
+#include <memory>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "evaluation/bag_options.hpp"
+#include "evaluation/kitti_io.hpp"
+#include "evaluation/recorded_run.hpp"
+#include "evaluation/scoring.hpp"
+
+namespace incremental_segmatch::apps {
+namespace {
+
+struct ScoreArguments {
+  KittiDriveOptions drive;
+  std::string results;
+  std::int64_t epoch_s = BagWriterOptions().epoch_s;
+};
+
+void PrintScore(const Score& score, const RunErrors& errors) {
+  std::printf("loops found         %zu true closures at %zu places, %zu of these driven in the opposite direction\n",
+              score.true_closures, score.places, score.places_opposite);
+  std::printf("false closures      %zu\n", score.false_closures);
+  if (score.trivial_closures + score.unmatched_closures > 0) {
+    std::printf("not counted         %zu to a place just left, %zu with stamps of no scan\n", score.trivial_closures,
+                score.unmatched_closures);
+  }
+  if (score.true_closures > 0) {
+    std::printf("their relative pose off by %.2f m and %.2f degrees in the median, %.2f m and %.2f degrees for 95 %%\n",
+                score.translation_error_median_m, score.rotation_error_median_deg, score.translation_error_95_m,
+                score.rotation_error_95_deg);
+  }
+  std::printf("trajectory error    %.2f m before, %.2f m after (RMSE after alignment, %zu poses)\n", errors.odometry_m,
+              errors.optimized_m, errors.poses);
+  std::printf("to compare with     %.2f m, which the same pose graph reaches with the true relative poses\n",
+              errors.bound_same_places_m);
+}
+
+void ScoreRun(const ScoreArguments& arguments) {
+  const KittiDrive drive(arguments.drive);
+  std::vector<StampNs> stamps_ns;
+  std::vector<Pose> truth;
+  for (std::size_t i = 0; i < drive.size(); ++i) {
+    const std::optional<Pose> pose = drive.T_world_sensor(i);
+    if (!pose) throw std::runtime_error(drive.name() + " has no ground truth: nothing can be scored");
+    stamps_ns.push_back(drive.stamp_ns(i) + arguments.epoch_s * 1'000'000'000);
+    truth.push_back(*pose);
+  }
+  const RecordedRun run = ReadRecordedRun(arguments.results);
+  const Score score = ScoreClosures(stamps_ns, truth, run.closures, {});
+  PrintScore(score, MeasureRun(run, stamps_ns, truth));
+  if (score.true_closures == 0) throw std::runtime_error("no loop was found");
+}
+
+}  // namespace
+
+void AddScoreCommand(CLI::App& app) {
+  const auto arguments = std::make_shared<ScoreArguments>();
+  CLI::App* command = app.add_subcommand(
+      "score",
+      "Judge what the nodelets recorded in their output_dir (closures.csv, trajectory_*.tum, pose_graph.g2o) while a\n"
+      "bag of segmatch kitti2bag was played, against the truth of the drive that the bag was made of. By the same\n"
+      "definitions as segmatch evaluate. Fails if no loop was found.\n\n"
+      "  segmatch score --kitti data --sequence 00 --results demo_results\n");
+  command->add_option("--kitti", arguments->drive.root, "folder that holds sequences/ and poses/ (ROOT)")->required();
+  command->add_option("--sequence", arguments->drive.sequence, "name of the sequence (SS)")->required();
+  command->add_option("--results", arguments->results, "folder that the run wrote into")
+      ->required()
+      ->check(CLI::ExistingDirectory);
+  command->add_option("--epoch", arguments->epoch_s, "seconds that kitti2bag added to the stamps")
+      ->check(CLI::NonNegativeNumber)
+      ->capture_default_str();
+  command->callback([arguments] { ScoreRun(*arguments); });
+}
+
+}  // namespace incremental_segmatch::apps
