@@ -88,8 +88,8 @@ void BackEndNodelet::Start() {
   diagnostics_ = std::make_unique<diagnostic_updater::Updater>(nh, getPrivateNodeHandle(), getName());
   diagnostics_->setHardwareID("none");
   diagnostics_->add("back end", this, &BackEndNodelet::Diagnose);
-  diagnostics_timer_ = nh.createWallTimer(ros::WallDuration(1.0),
-                                          [this](const ros::WallTimerEvent&) { diagnostics_->force_update(); });
+  diagnostics_timer_ =
+      nh.createWallTimer(ros::WallDuration(1.0), [this](const ros::WallTimerEvent&) { diagnostics_->force_update(); });
 }
 
 void BackEndNodelet::Subscribe(const std::string& robot) {
@@ -114,8 +114,8 @@ void BackEndNodelet::StartOver() {
   if (parameters_.map_file.empty()) {
     back_end_ = std::make_unique<BackEnd>(core_parameters_);
   } else {
-    back_end_ = std::make_unique<BackEnd>(core_parameters_,
-                                          TargetMap::Load(parameters_.map_file, core_parameters_.target_map));
+    back_end_ =
+        std::make_unique<BackEnd>(core_parameters_, TargetMap::Load(parameters_.map_file, core_parameters_.target_map));
     NODELET_INFO("%zu target segments loaded from %s", back_end_->map().segments().size(),
                  parameters_.map_file.c_str());
   }
@@ -169,8 +169,7 @@ void BackEndNodelet::ProcessSegments(const SegmentArray& message, const std::str
     return ProcessSegments(message, topic);
   }
   if (session.change == RobotSessions::Change::kRestarted)
-    NODELET_WARN("the front end of %s has started over: it goes on as %s", message.robot.c_str(),
-                 session.name.c_str());
+    NODELET_WARN("the front end of %s has started over: it goes on as %s", message.robot.c_str(), session.name.c_str());
 
   Robot& robot = Meet(session, message);
   const SegmentDelta delta = ToSegmentDelta(message, session.name);
@@ -214,7 +213,8 @@ void BackEndNodelet::CorrectTrajectory(const std::string& robot_name, const nav_
     if (!robot_name.empty() && robot.name != robot_name) continue;
     if (robot_name.empty() && robot.name != robots_.begin()->second.name) {
       if (throttle_.IsDue("trajectory", kWarnPeriod_s))
-        NODELET_WARN("several robots send segments on one topic: whose trajectory is corrected? Set the parameter robots");
+        NODELET_WARN(
+            "several robots send segments on one topic: whose trajectory is corrected? Set the parameter robots");
       return;
     }
     const std::optional<RobotIndex> index = FindRobot(back_end_->map(), session);
@@ -294,8 +294,7 @@ void BackEndNodelet::PublishLocalization(const LoopClosure& closure, const Segme
 void BackEndNodelet::PublishTransform(const SegmentDelta& delta, const Robot& robot) {
   if (!tf_broadcaster_ || !robot.T_map_odom) return;
   const ros::Time stamp = ToTime(delta.stamp_ns) + ros::Duration(parameters_.tf_tolerance_s);
-  tf_broadcaster_->sendTransform(
-      ToTransform(*robot.T_map_odom, parameters_.map_frame, robot.frames.odom_frame, stamp));
+  tf_broadcaster_->sendTransform(ToTransform(*robot.T_map_odom, parameters_.map_frame, robot.frames.odom_frame, stamp));
 }
 
 void BackEndNodelet::PublishMatches(const BackEndStep& step, const SegmentDelta& delta, const Robot& robot) {
@@ -304,8 +303,8 @@ void BackEndNodelet::PublishMatches(const BackEndStep& step, const SegmentDelta&
   header.frame_id = parameters_.map_frame;
   const Pose T_map_odom = MapOdom(delta.robot, robot);
   if (candidates_publisher_.getNumSubscribers() > 0)
-    candidates_publisher_.publish(LineMarker(
-        MatchLines(step.candidates, T_map_odom, parameters_.display_height_m), kCandidateStyle, header));
+    candidates_publisher_.publish(
+        LineMarker(MatchLines(step.candidates, T_map_odom, parameters_.display_height_m), kCandidateStyle, header));
   if (accepted_publisher_.getNumSubscribers() > 0) {
     const std::vector<SegmentMatch> matches = step.closure ? step.closure->matches : std::vector<SegmentMatch>();
     accepted_publisher_.publish(

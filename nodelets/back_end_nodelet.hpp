@@ -28,12 +28,13 @@
 
 namespace incremental_segmatch {
 
-/// The BackEnd of all robots. Callbacks only queue; the worker's thread owns the BackEnd and publishes. A delta that is missing
-/// makes it ask the robot's front end for a full state. A wrong parameter is FATAL, and the nodelet then stays idle.
+/// The BackEnd of all robots. Callbacks only queue; the worker's thread owns the BackEnd and publishes. A delta that is
+/// missing makes it ask the robot's front end for a full state. A wrong parameter is FATAL, and the nodelet then stays
+/// idle.
 ///
 /// Subscribes `segments` and `trajectory`, or `<robot>/segments` and `<robot>/trajectory`. Publishes `loop_closures`;
-/// `localization` and tf (in localization); `target_segments`, `candidate_matches`, `accepted_matches`, `closure_lines` for
-/// rviz; `back_end_steps`; diagnostics. Serves `save_map`, `load_map`.
+/// `localization` and tf (in localization); `target_segments`, `candidate_matches`, `accepted_matches`, `closure_lines`
+/// for rviz; `back_end_steps`; diagnostics. Serves `save_map`, `load_map`.
 class BackEndNodelet : public nodelet::Nodelet {
  public:
   ~BackEndNodelet() override;
@@ -43,9 +44,9 @@ class BackEndNodelet : public nodelet::Nodelet {
 
   /// A session of a robot. Owned by the worker's thread.
   struct Robot {
-    std::string name;                   ///< of the robot; the session's own name is the key
+    std::string name;  ///< of the robot; the session's own name is the key
     RobotFrames frames;
-    std::optional<Pose> T_map_odom;     ///< of the last recognition
+    std::optional<Pose> T_map_odom;  ///< of the last recognition
     Eigen::Vector3d position_odom = Eigen::Vector3d::Zero();
     double path_m = 0.0;
     std::optional<double> published_path_m;  ///< at the last published closure

@@ -123,8 +123,8 @@ SegmentState FromSegment(const Segment& message) {
   state.id = message.id;
   state.size = message.size;
   state.centroid_odom = ToVector(message.centroid);
-  state.descriptor = Eigen::Map<const Descriptor>(message.descriptor.data(),
-                                                  static_cast<Eigen::Index>(message.descriptor.size()));
+  state.descriptor =
+      Eigen::Map<const Descriptor>(message.descriptor.data(), static_cast<Eigen::Index>(message.descriptor.size()));
   state.new_view = message.new_view;
   state.points_centroid = RestorePoints(message);
   if (state.id == kNoSegment) throw std::invalid_argument("a segment has the ID 0, which means none");
@@ -135,16 +135,22 @@ SegmentState FromSegment(const Segment& message) {
 
 }  // namespace
 
-StampNs ToStampNs(const ros::Time& stamp) { return static_cast<StampNs>(stamp.toNSec()); }
+StampNs ToStampNs(const ros::Time& stamp) {
+  return static_cast<StampNs>(stamp.toNSec());
+}
 
 ros::Time ToTime(StampNs stamp_ns) {
   if (stamp_ns < 0) throw std::invalid_argument("ROS has no time before 0: " + std::to_string(stamp_ns) + " ns");
   return ros::Time().fromNSec(static_cast<std::uint64_t>(stamp_ns));
 }
 
-geometry_msgs::Point ToPoint(const Eigen::Vector3d& point) { return ToXyz<geometry_msgs::Point>(point); }
+geometry_msgs::Point ToPoint(const Eigen::Vector3d& point) {
+  return ToXyz<geometry_msgs::Point>(point);
+}
 
-Eigen::Vector3d ToVector(const geometry_msgs::Point& point) { return {point.x, point.y, point.z}; }
+Eigen::Vector3d ToVector(const geometry_msgs::Point& point) {
+  return {point.x, point.y, point.z};
+}
 
 geometry_msgs::Pose ToPoseMsg(const Pose& T) {
   geometry_msgs::Pose message;

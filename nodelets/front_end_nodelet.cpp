@@ -15,11 +15,11 @@ namespace {
 
 constexpr double kPollPeriod_s = 0.005;
 constexpr double kWarnPeriod_s = 5.0;
-constexpr StampNs kJumpBackNs = 1'000'000'000;    // stamps that go back by less are late messages, by more a new run
-constexpr StampNs kSameStampNs = 1'000'000;       // stacks pass stamps through doubles
+constexpr StampNs kJumpBackNs = 1'000'000'000;  // stamps that go back by less are late messages, by more a new run
+constexpr StampNs kSameStampNs = 1'000'000;     // stacks pass stamps through doubles
 constexpr std::size_t kHistorySize = 600;
-constexpr double kQuantisation = 0.1;             // of segment points, in voxels
-constexpr double kCoarseFloatDistance_m = 10e3;   // from here on, registered float clouds are coarser than a millimetre
+constexpr double kQuantisation = 0.1;            // of segment points, in voxels
+constexpr double kCoarseFloatDistance_m = 10e3;  // from here on, registered float clouds are coarser than a millimetre
 
 bool HasFinitePoint(const Points& points) {
   return std::any_of(points.begin(), points.end(), [](const Eigen::Vector3f& p) { return p.allFinite(); });
@@ -60,14 +60,14 @@ void FrontEndNodelet::Start() {
     odometry_subscriber_ = nh.subscribe("odometry", 200, &FrontEndNodelet::OnOdometry, this);
   if (parameters_.frame_jumps)
     trajectory_subscriber_ = nh.subscribe("trajectory", 1, &FrontEndNodelet::OnTrajectory, this);
-  cloud_subscriber_ = nh.subscribe("points", static_cast<std::uint32_t>(parameters_.queue_size),
-                                   &FrontEndNodelet::OnCloud, this);
+  cloud_subscriber_ =
+      nh.subscribe("points", static_cast<std::uint32_t>(parameters_.queue_size), &FrontEndNodelet::OnCloud, this);
 
   diagnostics_ = std::make_unique<diagnostic_updater::Updater>(nh, getPrivateNodeHandle(), getName());
   diagnostics_->setHardwareID("none");
   diagnostics_->add("front end", this, &FrontEndNodelet::Diagnose);
-  diagnostics_timer_ = nh.createWallTimer(ros::WallDuration(1.0),
-                                          [this](const ros::WallTimerEvent&) { diagnostics_->force_update(); });
+  diagnostics_timer_ =
+      nh.createWallTimer(ros::WallDuration(1.0), [this](const ros::WallTimerEvent&) { diagnostics_->force_update(); });
   NODELET_INFO("front end of %s: clouds from %s, poses from %s", parameters_.robot.c_str(),
                cloud_subscriber_.getTopic().c_str(),
                parameters_.pose_source == PoseSource::kTf ? "tf" : odometry_subscriber_.getTopic().c_str());
@@ -93,8 +93,7 @@ void FrontEndNodelet::OnTrajectory(const nav_msgs::PathConstPtr& path) {
   worker_->PostAlways([this, path] { FollowJump(*path); });
 }
 
-bool FrontEndNodelet::OnRequestFullState(RequestFullState::Request& /*request*/,
-                                         RequestFullState::Response& response) {
+bool FrontEndNodelet::OnRequestFullState(RequestFullState::Request& /*request*/, RequestFullState::Response& response) {
   worker_->PostAlways([this] { full_state_wanted_ = true; });
   response.success = true;
   response.message = "the next delta is a full state";
@@ -112,8 +111,8 @@ void FrontEndNodelet::ProcessCloud(const sensor_msgs::PointCloud2& cloud, Clock:
   try {
     scan.points_sensor = ReadScanPoints(cloud, *location);
     if (!HasFinitePoint(scan.points_sensor))
-      return Skip("no finite point", "none of the cloud's " + std::to_string(scan.points_sensor.size()) +
-                                         " points is finite");
+      return Skip("no finite point",
+                  "none of the cloud's " + std::to_string(scan.points_sensor.size()) + " points is finite");
     FrontEndStep step = front_end_->Process(scan);
     history_.push_back({scan.stamp_ns, scan.T_odom_sensor});
     if (history_.size() > kHistorySize) history_.pop_front();
@@ -253,7 +252,8 @@ void FrontEndNodelet::Diagnose(diagnostic_updater::DiagnosticStatusWrapper& stat
   else if (skipped != status_.reported_skipped)
     status.summary(DiagnosticStatus::WARN, "scans are skipped: " + status_.last_skip);
   else if (parameters_.registered && status_.distance_m > kCoarseFloatDistance_m)
-    status.summary(DiagnosticStatus::WARN, "so far from the origin, registered float clouds are coarse: publish doubles");
+    status.summary(DiagnosticStatus::WARN,
+                   "so far from the origin, registered float clouds are coarse: publish doubles");
   else if (status_.received == status_.reported_received)
     status.summary(DiagnosticStatus::OK, "waiting for clouds on " + cloud_subscriber_.getTopic());
   else

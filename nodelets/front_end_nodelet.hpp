@@ -27,12 +27,12 @@
 
 namespace incremental_segmatch {
 
-/// One robot's FrontEnd. Callbacks only queue; the worker's thread owns the FrontEnd, reads clouds, waits for their poses and
-/// publishes. Bad scans are skipped, counted and explained (log, diagnostics); a wrong parameter is FATAL, and the nodelet
-/// then stays idle.
+/// One robot's FrontEnd. Callbacks only queue; the worker's thread owns the FrontEnd, reads clouds, waits for their
+/// poses and publishes. Bad scans are skipped, counted and explained (log, diagnostics); a wrong parameter is FATAL,
+/// and the nodelet then stays idle.
 ///
-/// Subscribes `points`; `odometry` if that is the source of poses; `trajectory` if odom jumps. Publishes `segments`, `local_cloud`
-/// (coloured by segment), `front_end_steps`, diagnostics. Serves `<segments>/request_full_state`.
+/// Subscribes `points`; `odometry` if that is the source of poses; `trajectory` if odom jumps. Publishes `segments`,
+/// `local_cloud` (coloured by segment), `front_end_steps`, diagnostics. Serves `<segments>/request_full_state`.
 class FrontEndNodelet : public nodelet::Nodelet {
  public:
   ~FrontEndNodelet() override;
@@ -50,8 +50,8 @@ class FrontEndNodelet : public nodelet::Nodelet {
     FrontEndCounts counts;
     StageTimes times;
     std::size_t memory_bytes = 0;
-    double distance_m = 0.0;                     ///< of the sensor from odom's origin
-    std::size_t reported_received = 0;           ///< at the last report, as the next two
+    double distance_m = 0.0;            ///< of the sensor from odom's origin
+    std::size_t reported_received = 0;  ///< at the last report, as the next two
     std::size_t reported_processed = 0;
     std::size_t reported_skipped = 0;
     Clock::time_point reported = Clock::now();

@@ -1,6 +1,6 @@
 /// \file
-/// Our message types, beside the core's types of the same names: catkin puts messages into the package's namespace, where the
-/// core has a LoopClosure of its own. In the nodelets the message is called LoopClosureMsg.
+/// Our message types, beside the core's types of the same names: catkin puts messages into the package's namespace,
+/// where the core has a LoopClosure of its own. In the nodelets the message is called LoopClosureMsg.
 #pragma once
 
 #define LoopClosure LoopClosureMsg

@@ -248,7 +248,8 @@ std::string ToYamlText(const XmlRpcValue& constant) {
     }
     case XmlRpcValue::TypeStruct: {
       std::string text;
-      for (auto& [name, member] : value) text += (text.empty() ? "" : ", ") + QuoteYaml(name) + ": " + ToYamlText(member);
+      for (auto& [name, member] : value)
+        text += (text.empty() ? "" : ", ") + QuoteYaml(name) + ": " + ToYamlText(member);
       return "{" + text + "}";
     }
     default:

@@ -1,6 +1,7 @@
 /// \file
-/// Parameters of the nodelets: plain structs, read from the private ROS parameter tree. Unknown names are refused. The core's
-/// parameters come from one YAML file (`config_file`) or from the subtree of the same names (`front_end`, `back_end`).
+/// Parameters of the nodelets: plain structs, read from the private ROS parameter tree. Unknown names are refused. The
+/// core's parameters come from one YAML file (`config_file`) or from the subtree of the same names (`front_end`,
+/// `back_end`).
 #pragma once
 
 #include <XmlRpcValue.h>
@@ -20,47 +21,49 @@ enum class PoseSource { kTf, kOdometry };
 
 /// Of FrontEndNodelet.
 struct FrontEndNodeParameters {
-  std::string robot = "robot";           ///< name of the robot, unique among those of one back end
-  PoseSource pose_source = PoseSource::kTf;  ///< `tf` (odom_frame to sensor) or `odometry` (topic, plus tf from its child frame to the sensor)
-  bool registered = false;               ///< clouds are in odom_frame already, instead of in the sensor's frame
-  std::string odom_frame = "odom";       ///< frame that drifts but does not jump
-  std::string base_frame = "base_link";  ///< frame that trajectories and closures are about; empty: the sensor's
-  std::string sensor_frame;              ///< of the LiDAR; empty: the cloud's frame_id (not possible if registered)
-  double pose_timeout_s = 0.5;           ///< how long a cloud waits for its pose, by the wall clock
-  double odometry_max_gap_s = 0.5;       ///< longest time between odometry messages over which is interpolated
-  bool frame_jumps = false;              ///< odom_frame jumps at corrections: follow the topic `trajectory`
+  std::string robot = "robot";               ///< name of the robot, unique among those of one back end
+  PoseSource pose_source = PoseSource::kTf;  ///< `tf` (odom_frame to sensor) or `odometry` (topic, plus tf from its
+                                             ///< child frame to the sensor)
+  bool registered = false;                   ///< clouds are in odom_frame already, instead of in the sensor's frame
+  std::string odom_frame = "odom";           ///< frame that drifts but does not jump
+  std::string base_frame = "base_link";      ///< frame that trajectories and closures are about; empty: the sensor's
+  std::string sensor_frame;                  ///< of the LiDAR; empty: the cloud's frame_id (not possible if registered)
+  double pose_timeout_s = 0.5;               ///< how long a cloud waits for its pose, by the wall clock
+  double odometry_max_gap_s = 0.5;           ///< longest time between odometry messages over which is interpolated
+  bool frame_jumps = false;                  ///< odom_frame jumps at corrections: follow the topic `trajectory`
   FrameKind trajectory_kind = FrameKind::kBase;  ///< whose poses `trajectory` holds: `base` or `sensor`
-  int queue_size = 5;                    ///< clouds; when full, the oldest goes
-  bool send_points = true;               ///< of new views of segments, for refinement
+  int queue_size = 5;                            ///< clouds; when full, the oldest goes
+  bool send_points = true;                       ///< of new views of segments, for refinement
 };
 
 /// Of BackEndNodelet.
 struct BackEndNodeParameters {
-  std::vector<std::string> robots;       ///< topics are <robot>/segments and <robot>/trajectory; none: segments and trajectory
+  std::vector<std::string>
+      robots;  ///< topics are <robot>/segments and <robot>/trajectory; none: segments and trajectory
   std::string map_frame = "map";
   FrameKind closure_kind = FrameKind::kBase;     ///< frames of published closures: `base` or `sensor`
   FrameKind trajectory_kind = FrameKind::kBase;  ///< whose poses corrected trajectories hold
-  double closure_min_distance_m = 2.0;   ///< way of the robot between published closures; 0: no limit
-  double closure_min_interval_s = 0.0;   ///< time between published closures; 0: no limit
-  std::string map_file;                  ///< target map to load; empty: none
-  std::string output_dir;                ///< folder for closures.csv; empty: none
-  bool publish_tf = true;                ///< in localization: map_frame to odom
-  double tf_tolerance_s = 0.1;           ///< so far in the future is the transform's stamp
-  double display_period_s = 1.0;         ///< between target maps for rviz
-  double display_height_m = 0.0;         ///< target segments, and the matches' ends there, are shown so much higher
-  int queue_size = 100;                  ///< segment arrays; when full, the oldest goes
+  double closure_min_distance_m = 2.0;           ///< way of the robot between published closures; 0: no limit
+  double closure_min_interval_s = 0.0;           ///< time between published closures; 0: no limit
+  std::string map_file;                          ///< target map to load; empty: none
+  std::string output_dir;                        ///< folder for closures.csv; empty: none
+  bool publish_tf = true;                        ///< in localization: map_frame to odom
+  double tf_tolerance_s = 0.1;                   ///< so far in the future is the transform's stamp
+  double display_period_s = 1.0;                 ///< between target maps for rviz
+  double display_height_m = 0.0;  ///< target segments, and the matches' ends there, are shown so much higher
+  int queue_size = 100;           ///< segment arrays; when full, the oldest goes
 };
 
 /// Of PoseGraphNodelet.
 struct PoseGraphNodeParameters {
-  std::vector<std::string> robots;       ///< as for the back end
+  std::vector<std::string> robots;  ///< as for the back end
   std::string map_frame = "map";
   FrameKind trajectory_kind = FrameKind::kBase;  ///< whose poses published paths hold
-  bool publish_tf = true;                ///< map_frame to odom
-  double tf_tolerance_s = 0.1;           ///< so far in the future is the transform's stamp
-  std::string output_dir;                ///< folder for trajectories (TUM) and graph (g2o) at the end; empty: none
-  int queue_size = 1000;                 ///< segment arrays; when full, the oldest goes
-  PoseGraphParameters pose_graph;        ///< subtree `pose_graph`
+  bool publish_tf = true;                        ///< map_frame to odom
+  double tf_tolerance_s = 0.1;                   ///< so far in the future is the transform's stamp
+  std::string output_dir;          ///< folder for trajectories (TUM) and graph (g2o) at the end; empty: none
+  int queue_size = 1000;           ///< segment arrays; when full, the oldest goes
+  PoseGraphParameters pose_graph;  ///< subtree `pose_graph`
 };
 
 /// What one nodelet reads: its own parameters and the core's.

@@ -17,8 +17,8 @@ using sensor_msgs::PointField;
 constexpr std::uint32_t kUnsegmentedRgb = 0x606060;
 
 std::string TypeName(std::uint8_t datatype) {
-  static constexpr std::array<const char*, 9> kNames{"?",      "INT8",  "UINT8",   "INT16",  "UINT16",
-                                                     "INT32",  "UINT32", "FLOAT32", "FLOAT64"};
+  static constexpr std::array<const char*, 9> kNames{"?",     "INT8",   "UINT8",   "INT16",  "UINT16",
+                                                     "INT32", "UINT32", "FLOAT32", "FLOAT64"};
   return datatype < kNames.size() ? kNames[datatype] : "type " + std::to_string(datatype);
 }
 
@@ -41,13 +41,13 @@ Layout FindLayout(const PointCloud2& cloud) {
   std::array<std::uint8_t, 3> types{};
   for (std::size_t axis = 0; axis < 3; ++axis) {
     const std::string name(1, "xyz"[axis]);
-    const auto field = std::find_if(cloud.fields.begin(), cloud.fields.end(),
-                                    [&name](const PointField& f) { return f.name == name; });
+    const auto field =
+        std::find_if(cloud.fields.begin(), cloud.fields.end(), [&name](const PointField& f) { return f.name == name; });
     if (field == cloud.fields.end())
       throw std::invalid_argument("the cloud has no field " + name + "; its fields are: " + FieldList(cloud));
     if (field->datatype != PointField::FLOAT32 && field->datatype != PointField::FLOAT64)
-      throw std::invalid_argument("the cloud's field " + name + " is neither FLOAT32 nor FLOAT64; its fields are: " +
-                                  FieldList(cloud));
+      throw std::invalid_argument("the cloud's field " + name +
+                                  " is neither FLOAT32 nor FLOAT64; its fields are: " + FieldList(cloud));
     layout.offsets[axis] = field->offset;
     types[axis] = field->datatype;
   }
@@ -65,7 +65,8 @@ void CheckSize(const PointCloud2& cloud, const Layout& layout) {
       throw std::invalid_argument("the cloud's fields reach beyond its point_step of " +
                                   std::to_string(cloud.point_step) + " bytes; its fields are: " + FieldList(cloud));
   const std::size_t row = width * cloud.point_step;
-  const std::size_t needed = cloud.height == 0 || width == 0 ? 0 : (cloud.height - 1) * std::size_t{cloud.row_step} + row;
+  const std::size_t needed =
+      cloud.height == 0 || width == 0 ? 0 : (cloud.height - 1) * std::size_t{cloud.row_step} + row;
   if ((cloud.height > 1 && cloud.row_step < row) || cloud.data.size() < needed)
     throw std::invalid_argument("the cloud's data has " + std::to_string(cloud.data.size()) + " bytes, too few for " +
                                 std::to_string(cloud.height) + " rows of " + std::to_string(width) + " points");

@@ -12,9 +12,10 @@
 
 namespace incremental_segmatch {
 
-/// Points of a cloud, in the cloud's order and frame: x, y, z as FLOAT32 or FLOAT64 at any offset, with any other fields and
-/// padding, organised or not, either byte order; NaN are kept. Throws std::invalid_argument, naming the fields that are
-/// there, if x, y or z is missing or of another type, or if the data is shorter than the header says. O(points).
+/// Points of a cloud, in the cloud's order and frame: x, y, z as FLOAT32 or FLOAT64 at any offset, with any other
+/// fields and padding, organised or not, either byte order; NaN are kept. Throws std::invalid_argument, naming the
+/// fields that are there, if x, y or z is missing or of another type, or if the data is shorter than the header says.
+/// O(points).
 Points ReadPoints(const sensor_msgs::PointCloud2& cloud);
 
 /// The same, moved into frame a before they are rounded to float: so double clouds far from their origin stay exact.

@@ -12,7 +12,9 @@ std::string Seconds(StampNs duration_ns) {
   return text;
 }
 
-bool IsBefore(const StampedPose& pose, StampNs stamp_ns) { return pose.stamp_ns < stamp_ns; }
+bool IsBefore(const StampedPose& pose, StampNs stamp_ns) {
+  return pose.stamp_ns < stamp_ns;
+}
 
 Pose Interpolate(const StampedPose& a, const StampedPose& b, StampNs stamp_ns) {
   const double share = static_cast<double>(stamp_ns - a.stamp_ns) / static_cast<double>(b.stamp_ns - a.stamp_ns);
@@ -61,7 +63,8 @@ bool PoseBuffer::ReachesTo(StampNs stamp_ns) const {
 std::string PoseBuffer::WhyNot(StampNs stamp_ns) const {
   const std::lock_guard<std::mutex> lock(mutex_);
   if (poses_.empty()) return "no odometry has come";
-  if (stamp_ns > poses_.back().stamp_ns) return "odometry ends " + Seconds(stamp_ns - poses_.back().stamp_ns) + " before it";
+  if (stamp_ns > poses_.back().stamp_ns)
+    return "odometry ends " + Seconds(stamp_ns - poses_.back().stamp_ns) + " before it";
   if (stamp_ns < poses_.front().stamp_ns)
     return "odometry begins " + Seconds(poses_.front().stamp_ns - stamp_ns) + " after it";
   return "odometry has a gap of more than " + Seconds(max_gap_ns_) + " around it";

@@ -18,12 +18,13 @@ class PoseBuffer {
   /// \param max_gap_s   longest time between two poses over which is interpolated
   PoseBuffer(double keep_s, double max_gap_s);
 
-  /// Adds a pose. One that is older than the newest starts the buffer anew (time jumped back); one with the same stamp is ignored.
+  /// Adds a pose. One that is older than the newest starts the buffer anew (time jumped back); one with the same stamp
+  /// is ignored.
   void Add(const StampedPose& pose);
   void Clear();
 
-  /// The pose at a stamp, linearly interpolated (rotation: slerp). Nothing if the stamp is not between two poses that are
-  /// at most the gap apart. O(log poses).
+  /// The pose at a stamp, linearly interpolated (rotation: slerp). Nothing if the stamp is not between two poses that
+  /// are at most the gap apart. O(log poses).
   std::optional<Pose> At(StampNs stamp_ns) const;
 
   /// True if poses reach up to the stamp: waiting longer brings nothing new.

@@ -51,20 +51,21 @@ void PoseGraphNodelet::Start() {
   write_service_ = nh.advertiseService("write_trajectories", &PoseGraphNodelet::OnWrite, this);
   if (parameters_.robots.empty()) Subscribe("");
   for (const std::string& robot : parameters_.robots) Subscribe(robot);
-  const boost::function<void(const LoopClosureMsgConstPtr&)> on_closure = [this](const LoopClosureMsgConstPtr& closure) {
-    worker_->PostAlways([this, closure] {
-      waiting_closures_.push_back(closure);
-      AddWaitingClosures();
-      OptimizeIfIdle();
-    });
-  };
+  const boost::function<void(const LoopClosureMsgConstPtr&)> on_closure =
+      [this](const LoopClosureMsgConstPtr& closure) {
+        worker_->PostAlways([this, closure] {
+          waiting_closures_.push_back(closure);
+          AddWaitingClosures();
+          OptimizeIfIdle();
+        });
+      };
   subscribers_.push_back(nh.subscribe<LoopClosureMsg>("loop_closures", 100, on_closure));
 
   diagnostics_ = std::make_unique<diagnostic_updater::Updater>(nh, getPrivateNodeHandle(), getName());
   diagnostics_->setHardwareID("none");
   diagnostics_->add("pose graph", this, &PoseGraphNodelet::Diagnose);
-  diagnostics_timer_ = nh.createWallTimer(ros::WallDuration(1.0),
-                                          [this](const ros::WallTimerEvent&) { diagnostics_->force_update(); });
+  diagnostics_timer_ =
+      nh.createWallTimer(ros::WallDuration(1.0), [this](const ros::WallTimerEvent&) { diagnostics_->force_update(); });
 }
 
 void PoseGraphNodelet::Subscribe(const std::string& robot) {
@@ -174,7 +175,9 @@ void PoseGraphNodelet::Optimize() {
   status_.optimization_ms = std::chrono::duration<double, std::milli>(Clock::now() - start).count();
 }
 
-bool PoseGraphNodelet::IsInMap(const Robot& robot) const { return graph_->AreConnected(0, robot.index); }
+bool PoseGraphNodelet::IsInMap(const Robot& robot) const {
+  return graph_->AreConnected(0, robot.index);
+}
 
 void PoseGraphNodelet::PublishTransform(const Robot& robot, const ros::Time& stamp) {
   if (!tf_broadcaster_ || !IsInMap(robot)) return;
@@ -191,9 +194,9 @@ void PoseGraphNodelet::PublishPaths() {
     if (publishers.trajectory.getNumSubscribers() > 0 && IsInMap(robot))
       publishers.trajectory.publish(boost::make_shared<const nav_msgs::Path>(CorrectedPath(robot)));
     if (publishers.odometry_path.getNumSubscribers() > 0)
-      publishers.odometry_path.publish(
-          boost::make_shared<const nav_msgs::Path>(ToPath(robot.odometry, parameters_.trajectory_kind, robot.frames,
-                                                          parameters_.map_frame, ToTime(robot.odometry.back().stamp_ns))));
+      publishers.odometry_path.publish(boost::make_shared<const nav_msgs::Path>(
+          ToPath(robot.odometry, parameters_.trajectory_kind, robot.frames, parameters_.map_frame,
+                 ToTime(robot.odometry.back().stamp_ns))));
   }
 }
 

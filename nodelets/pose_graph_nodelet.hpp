@@ -25,14 +25,15 @@
 
 namespace incremental_segmatch {
 
-/// The PoseGraph of all robots. Callbacks only queue; the worker's thread owns the graph, and optimizes it when closures
-/// have come and nothing else waits. A wrong parameter is FATAL, and the nodelet then stays idle.
+/// The PoseGraph of all robots. Callbacks only queue; the worker's thread owns the graph, and optimizes it when
+/// closures have come and nothing else waits. A wrong parameter is FATAL, and the nodelet then stays idle.
 ///
-/// Subscribes `segments` or `<robot>/segments` (for the sensor's poses) and `loop_closures`. Publishes, under the same prefix,
-/// `trajectory` (corrected, in the map frame; after every optimization and now and then) and `odometry_path` (where odometry
-/// alone has the robot; in the map frame, too, as if both began at one place); tf map to odom. A robot that no closure connects
-/// with the first one has no place in the map yet, so neither trajectory nor tf. Serves `write_trajectories`. At the
-/// end, and when asked to, writes trajectories of the sensor (TUM) and the graph (g2o), where `output_dir` says so.
+/// Subscribes `segments` or `<robot>/segments` (for the sensor's poses) and `loop_closures`. Publishes, under the same
+/// prefix, `trajectory` (corrected, in the map frame; after every optimization and now and then) and `odometry_path`
+/// (where odometry alone has the robot; in the map frame, too, as if both began at one place); tf map to odom. A robot
+/// that no closure connects with the first one has no place in the map yet, so neither trajectory nor tf. Serves
+/// `write_trajectories`. At the end, and when asked to, writes trajectories of the sensor (TUM) and the graph (g2o),
+/// where `output_dir` says so.
 class PoseGraphNodelet : public nodelet::Nodelet {
  public:
   ~PoseGraphNodelet() override;
@@ -42,10 +43,10 @@ class PoseGraphNodelet : public nodelet::Nodelet {
 
   /// A session of a robot.
   struct Robot {
-    std::string name;                       ///< of the robot; the session's own name is the key
-    RobotIndex index = 0;                   ///< in the graph
+    std::string name;      ///< of the robot; the session's own name is the key
+    RobotIndex index = 0;  ///< in the graph
     RobotFrames frames;
-    std::vector<StampedPose> odometry;      ///< T_odom_sensor
+    std::vector<StampedPose> odometry;  ///< T_odom_sensor
   };
   struct Publishers {
     ros::Publisher trajectory;
@@ -60,7 +61,7 @@ class PoseGraphNodelet : public nodelet::Nodelet {
     std::string last_error;
     PoseGraphReport report;
     double optimization_ms = 0.0;
-    std::size_t reported_refused = 0;       ///< at the last report
+    std::size_t reported_refused = 0;  ///< at the last report
   };
 
   void onInit() override;
@@ -99,8 +100,8 @@ class PoseGraphNodelet : public nodelet::Nodelet {
   // Owned by the worker's thread.
   std::unique_ptr<PoseGraph> graph_;
   RobotSessions sessions_;
-  std::map<std::string, Robot> robots_;               // by session
-  std::map<std::string, std::string> newest_session_; // by prefix
+  std::map<std::string, Robot> robots_;                   // by session
+  std::map<std::string, std::string> newest_session_;     // by prefix
   std::vector<LoopClosureMsgConstPtr> waiting_closures_;  // for the query's pose
   bool has_new_closures_ = false;
 

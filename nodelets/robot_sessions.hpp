@@ -10,9 +10,9 @@
 
 namespace incremental_segmatch {
 
-/// Names a robot's sessions for the core, to which segment IDs and stamps of one name must be consistent: the first session
-/// has the robot's own name, later ones `name#2`, `name#3`. So what a robot saw before its front end was restarted stays in the
-/// map, and the two trajectories find together by a loop closure like those of two robots.
+/// Names a robot's sessions for the core, to which segment IDs and stamps of one name must be consistent: the first
+/// session has the robot's own name, later ones `name#2`, `name#3`. So what a robot saw before its front end was
+/// restarted stays in the map, and the two trajectories find together by a loop closure like those of two robots.
 class RobotSessions {
  public:
   enum class Change {

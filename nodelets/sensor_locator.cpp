@@ -49,8 +49,8 @@ LocateResult SensorLocator::Locate(const ros::Time& stamp, const std::string& se
   if (!odom_sensor.T_target_source) return {std::nullopt, odom_sensor.reason};
   const TransformResult base_sensor = LookUp(base_frame, sensor_frame, stamp);
   if (!base_sensor.T_target_source)
-    return {std::nullopt, base_sensor.reason + " (base_frame may be empty where the robot has no other than " +
-                              sensor_frame + ")"};
+    return {std::nullopt,
+            base_sensor.reason + " (base_frame may be empty where the robot has no other than " + sensor_frame + ")"};
   return {SensorLocation{*odom_sensor.T_target_source,
                          {odom_frame, base_frame, sensor_frame, *base_sensor.T_target_source}},
           ""};
@@ -62,8 +62,8 @@ SensorLocator::TransformResult SensorLocator::LookUp(const std::string& target, 
   try {
     return {ToPose(tf_buffer_.lookupTransform(target, source, stamp).transform, "tf"), ""};
   } catch (const tf2::TransformException& error) {
-    return {std::nullopt, "no tf from " + target + " to " + source + " at " + Text(stamp) + ": " + error.what() +
-                              "; " + KnownFrames()};
+    return {std::nullopt, "no tf from " + target + " to " + source + " at " + Text(stamp) + ": " + error.what() + "; " +
+                              KnownFrames()};
   }
 }
 

@@ -9,8 +9,8 @@
 
 namespace incremental_segmatch {
 
-/// Lets one thing of a kind through in a period of the wall clock. (roscpp's own throttle follows simulated time, and so is
-/// silent where that stands still.) All functions may be called from any thread.
+/// Lets one thing of a kind through in a period of the wall clock. (roscpp's own throttle follows simulated time, and
+/// so is silent where that stands still.) All functions may be called from any thread.
 class Throttle {
  public:
   /// True if this kind was not let through in the last `period_s`.

@@ -32,7 +32,8 @@ void Worker::Post(Job job) {
   {
     const std::lock_guard<std::mutex> lock(mutex_);
     if (queued_ == capacity_) {
-      entries_.erase(std::find_if(entries_.begin(), entries_.end(), [](const Entry& entry) { return entry.droppable; }));
+      entries_.erase(
+          std::find_if(entries_.begin(), entries_.end(), [](const Entry& entry) { return entry.droppable; }));
       --queued_;
       ++dropped_;
     }

@@ -15,15 +15,16 @@
 
 namespace incremental_segmatch {
 
-/// Runs jobs one after the other in a thread of its own. The queue is bounded: a job that comes when it is full pushes the
-/// oldest droppable one out. Jobs still waiting at the end are dropped unrun. All functions may be called from any thread.
+/// Runs jobs one after the other in a thread of its own. The queue is bounded: a job that comes when it is full pushes
+/// the oldest droppable one out. Jobs still waiting at the end are dropped unrun. All functions may be called from any
+/// thread.
 class Worker {
  public:
   using Job = std::function<void()>;
   using ErrorHandler = std::function<void(const std::string&)>;
 
-  /// `on_error` is called, in the worker's thread, with the message of an exception that a job throws; the worker goes on.
-  /// Throws std::invalid_argument unless capacity > 0.
+  /// `on_error` is called, in the worker's thread, with the message of an exception that a job throws; the worker goes
+  /// on. Throws std::invalid_argument unless capacity > 0.
   Worker(std::size_t capacity, ErrorHandler on_error);
   /// Waits for the running job, drops the others.
   ~Worker();
@@ -35,8 +36,8 @@ class Worker {
   /// Queues something that must not be lost: a service call, a setting. Does not count towards the capacity.
   void PostAlways(Job job);
 
-  /// Runs a function in the worker's thread and waits for its result; throws what it throws, or std::future_error if the
-  /// worker ends before. Not to be called from a job.
+  /// Runs a function in the worker's thread and waits for its result; throws what it throws, or std::future_error if
+  /// the worker ends before. Not to be called from a job.
   template <class Function>
   auto Run(Function function) {
     auto task = std::make_shared<std::packaged_task<decltype(function())()>>(std::move(function));

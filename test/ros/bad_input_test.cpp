@@ -1,0 +1,315 @@
+// What a user may get wrong, and the message that comes.
+#include <diagnostic_msgs/DiagnosticArray.h>
+#include <gtest/gtest.h>
+#include <incremental_segmatch/RequestFullState.h>
+#include <nav_msgs/Odometry.h>
+#include <nodelet/NodeletList.h>
+#include <nodelet/NodeletLoad.h>
+#include <ros/ros.h>
+#include <rosgraph_msgs/Log.h>
+#include <tf2_ros/static_transform_broadcaster.h>
+#include <tf2_ros/transform_broadcaster.h>
+
+#include <algorithm>
+#include <limits>
+#include <map>
+#include <string>
+#include <vector>
+
+#include "conversions.hpp"
+#include "synthetic_drive.hpp"
+#include "waiting.hpp"
+
+namespace incremental_segmatch {
+namespace {
+
+using test::SyntheticDrive;
+using test::WaitFor;
+
+/// Hears all that nodelets say: log, diagnostics, segments.
+class BadInput : public testing::Test {
+ protected:
+  static void SetUpTestSuite() { drive_ = new SyntheticDrive(); }
+  static void TearDownTestSuite() { delete drive_; }
+
+  void SetUp() override {
+    log_ = nh_.subscribe<rosgraph_msgs::Log>("/rosout", 500, [this](const rosgraph_msgs::LogConstPtr& m) {
+      said_.push_back({m->level, m->msg});
+    });
+    diagnostics_ = nh_.subscribe<diagnostic_msgs::DiagnosticArray>(
+        "/diagnostics", 100, [this](const diagnostic_msgs::DiagnosticArrayConstPtr& m) {
+          for (const auto& status : m->status)
+            for (const auto& value : status.values) diagnosed_[status.name][value.key] = value.value;
+        });
+    ASSERT_TRUE(WaitFor([this] { return log_.getNumPublishers() > 0 && diagnostics_.getNumPublishers() > 0; }));
+  }
+
+  /// Loads a front end of the given name, with its topics below that name. Returns false if it can't be loaded.
+  bool Load(const std::string& name, const std::string& type = "incremental_segmatch/FrontEndNodelet") {
+    nodelet::NodeletLoad load;
+    load.request.name = "/" + name;
+    load.request.type = type;
+    for (const std::string topic : {"points", "odometry", "segments", "local_cloud", "front_end_steps", "loop_closures",
+                                    "trajectory", "save_map", "load_map"}) {
+      load.request.remap_source_args.push_back("/" + topic);
+      load.request.remap_target_args.push_back("/" + name + "/" + topic);
+    }
+    if (!ros::service::waitForService("/manager/load_nodelet", 10000)) return false;
+    if (!ros::service::call("/manager/load_nodelet", load) || !load.response.success) return false;
+    clouds_ = nh_.advertise<sensor_msgs::PointCloud2>("/" + name + "/points", 10);
+    segments_ = nh_.subscribe<SegmentArray>("/" + name + "/segments", 10,
+                                            [this](const SegmentArrayConstPtr& m) { received_.push_back(*m); });
+    return true;
+  }
+
+  bool LoadAndConnect(const std::string& name) {
+    return Load(name) &&
+           WaitFor([this] { return clouds_.getNumSubscribers() > 0 && segments_.getNumPublishers() > 0; });
+  }
+
+  void PublishTf(int scan, const std::string& frame) {
+    tf_.sendTransform(ToTransform(drive_->T_odom_sensor(scan), "odom", frame, ToTime(drive_->stamp_ns(scan))));
+  }
+
+  bool IsSaid(const std::string& words, int level) const {
+    return std::any_of(said_.begin(), said_.end(), [&](const auto& line) {
+      return line.first == level && line.second.find(words) != std::string::npos;
+    });
+  }
+
+  testing::AssertionResult Hears(const std::string& words, int level = rosgraph_msgs::Log::WARN) {
+    if (WaitFor([&] { return IsSaid(words, level); }, 5.0)) return testing::AssertionSuccess();
+    testing::AssertionResult result = testing::AssertionFailure() << "nobody said \"" << words << "\", but:";
+    for (const auto& line : said_) result << "\n  " << line.second;
+    return result;
+  }
+
+  testing::AssertionResult Counts(const std::string& name, const std::string& key, int at_least = 1) {
+    const std::string status = name + ": front end";
+    const auto counted = [&] {
+      const auto it = diagnosed_[status].find(key);
+      return it != diagnosed_[status].end() && std::stoi(it->second) >= at_least;
+    };
+    if (WaitFor(counted, 5.0)) return testing::AssertionSuccess();
+    return testing::AssertionFailure() << "diagnostics do not count \"" << key << "\"";
+  }
+
+  /// The front end still does its work.
+  testing::AssertionResult Works(int scan, const std::string& frame) {
+    const std::size_t before = received_.size();
+    PublishTf(scan, frame);
+    clouds_.publish(drive_->Cloud(scan, frame));
+    if (WaitFor([&] { return received_.size() > before; }, 5.0)) return testing::AssertionSuccess();
+    return testing::AssertionFailure() << "no segments came for scan " << scan;
+  }
+
+  inline static SyntheticDrive* drive_ = nullptr;
+  ros::NodeHandle nh_;
+  ros::Publisher clouds_;
+  ros::Subscriber segments_, log_, diagnostics_;
+  tf2_ros::TransformBroadcaster tf_;
+  std::vector<SegmentArray> received_;
+  std::vector<std::pair<int, std::string>> said_;
+  std::map<std::string, std::map<std::string, std::string>> diagnosed_;
+};
+
+TEST_F(BadInput, EmptyAndInvalidCloudsAreSkipped) {
+  ASSERT_TRUE(LoadAndConnect("bad_clouds"));
+  ASSERT_TRUE(Works(0, "lidar_a"));
+
+  sensor_msgs::PointCloud2 empty = drive_->Cloud(1, "lidar_a");
+  empty.width = 0;
+  empty.row_step = 0;
+  empty.data.clear();
+  PublishTf(1, "lidar_a");
+  clouds_.publish(empty);
+  EXPECT_TRUE(Hears("the cloud is empty"));
+  EXPECT_TRUE(Counts("bad_clouds", "scans skipped: empty"));
+
+  sensor_msgs::PointCloud2 nameless = drive_->Cloud(1, "lidar_a");
+  nameless.fields[1].name = "azimuth";
+  clouds_.publish(nameless);
+  EXPECT_TRUE(Hears("the cloud has no field y; its fields are: x (FLOAT32), azimuth (FLOAT32)"));
+
+  const float nan = std::numeric_limits<float>::quiet_NaN();
+  std_msgs::Header header = nameless.header;
+  header.stamp = ToTime(drive_->stamp_ns(2));
+  PublishTf(2, "lidar_a");
+  clouds_.publish(ToPointCloud2(std::vector<ColouredPoint>(10, {{nan, nan, nan}, 0}), header));
+  EXPECT_TRUE(Hears("none of the cloud's 10 points is finite"));
+
+  header.stamp = ros::Time();
+  sensor_msgs::PointCloud2 timeless = drive_->Cloud(3, "lidar_a");
+  timeless.header = header;
+  clouds_.publish(timeless);
+  EXPECT_TRUE(Hears("stamp is 0"));
+
+  // Some NaN among good points are dropped and counted.
+  std::vector<ColouredPoint> points(25, {{nan, 1.f, 1.f}, 0});
+  for (const Eigen::Vector3f& p : drive_->Scan(4)) points.push_back({p, 0});
+  header.stamp = ToTime(drive_->stamp_ns(4));
+  PublishTf(4, "lidar_a");
+  clouds_.publish(ToPointCloud2(points, header));
+  EXPECT_TRUE(Counts("bad_clouds", "dropped_nonfinite", 25));
+  EXPECT_TRUE(Works(5, "lidar_a"));
+}
+
+TEST_F(BadInput, MissingTfIsExplainedAndNeverGuessed) {
+  ASSERT_TRUE(LoadAndConnect("no_tf"));
+  tf2_ros::StaticTransformBroadcaster others;
+  others.sendTransform(ToTransform(Pose::Identity(), "somewhere", "else", ros::Time::now()));
+  clouds_.publish(drive_->Cloud(0, "lidar_b"));
+  EXPECT_TRUE(Hears("no tf from odom to lidar_b"));
+  EXPECT_TRUE(Hears("the tree has:"));
+  EXPECT_TRUE(Hears("else"));
+  EXPECT_TRUE(Counts("no_tf", "scans skipped: no pose"));
+  EXPECT_TRUE(received_.empty());
+
+  // A transform that comes a little after its cloud is waited for.
+  clouds_.publish(drive_->Cloud(1, "lidar_b"));
+  WaitFor([] { return false; }, 0.1);
+  PublishTf(1, "lidar_b");
+  EXPECT_TRUE(WaitFor([this] { return received_.size() == 1; }, 5.0));
+}
+
+TEST_F(BadInput, TimeThatJumpsBackStartsOver) {
+  ASSERT_TRUE(LoadAndConnect("looped"));
+  for (int scan = 20; scan < 24; ++scan) ASSERT_TRUE(Works(scan, "lidar_c"));
+  ASSERT_EQ(received_.size(), 4u);
+  EXPECT_EQ(received_.back().sequence, 4u);
+  const std::uint64_t session = received_.back().session;
+
+  clouds_.publish(drive_->Cloud(23, "lidar_c"));  // the same again
+  EXPECT_TRUE(Hears("the cloud is not newer than the last one"));
+
+  clouds_.publish(drive_->Cloud(0, "lidar_c"));
+  EXPECT_TRUE(Hears("time jumped back by 23.0 s"));
+  for (int scan = 1; scan < 4; ++scan) ASSERT_TRUE(Works(scan, "lidar_c"));
+  EXPECT_NE(received_.back().session, session);
+  EXPECT_LE(received_.back().sequence, 4u);
+  EXPECT_TRUE(Counts("looped", "starts over"));
+}
+
+TEST_F(BadInput, FullStateComesOnRequest) {
+  ASSERT_TRUE(LoadAndConnect("full_state"));
+  for (int scan = 0; scan < 3; ++scan) ASSERT_TRUE(Works(scan, "lidar_d"));
+  EXPECT_FALSE(received_.back().full_state);
+  RequestFullState request;
+  ASSERT_TRUE(ros::service::call("/full_state/segments/request_full_state", request));
+  EXPECT_TRUE(request.response.success);
+  ASSERT_TRUE(Works(3, "lidar_d"));
+  EXPECT_TRUE(received_.back().full_state);
+  EXPECT_EQ(received_.back().sequence, 4u);
+  ASSERT_TRUE(Works(4, "lidar_d"));
+  EXPECT_FALSE(received_.back().full_state);
+}
+
+TEST_F(BadInput, OdometryIsInterpolatedBetweenMessages) {
+  ros::param::set("/odometry_pose/pose_source", "odometry");
+  ASSERT_TRUE(LoadAndConnect("odometry_pose"));
+  ros::Publisher publisher = nh_.advertise<nav_msgs::Odometry>("/odometry_pose/odometry", 10);
+  ASSERT_TRUE(WaitFor([&] { return publisher.getNumSubscribers() > 0; }));
+  const auto publish = [&](StampNs stamp_ns, double x) {
+    nav_msgs::Odometry odometry;
+    odometry.header.stamp = ToTime(stamp_ns);
+    odometry.header.frame_id = "odom";
+    odometry.child_frame_id = "lidar_e";
+    Pose T = Pose::Identity();
+    T.translation().x() = x;
+    odometry.pose.pose = ToPoseMsg(T);
+    publisher.publish(odometry);
+  };
+  const StampNs stamp_ns = drive_->stamp_ns(1);
+  publish(stamp_ns - 100000000, 1.0);
+  clouds_.publish(drive_->Cloud(1, "lidar_e"));
+  WaitFor([] { return false; }, 0.05);
+  EXPECT_TRUE(received_.empty());
+  publish(stamp_ns + 100000000, 2.0);
+  ASSERT_TRUE(WaitFor([this] { return received_.size() == 1; }, 5.0));
+  EXPECT_NEAR(received_[0].sensor_pose.position.x, 1.5, 1e-6);
+
+  clouds_.publish(drive_->Cloud(2, "lidar_e"));  // no odometry comes any more
+  EXPECT_TRUE(Hears("odometry ends"));
+}
+
+TEST_F(BadInput, RegisteredCloudsAreTakenBackIntoTheSensorsFrame) {
+  ros::param::set("/registered/registered", true);
+  ros::param::set("/registered/sensor_frame", "lidar_f");
+  ros::param::set("/registered/base_frame", "");
+  ASSERT_TRUE(LoadAndConnect("registered"));
+  clouds_.publish(drive_->Cloud(0, "map"));
+  EXPECT_TRUE(Hears("registered clouds come in frame map, but odom_frame is odom"));
+
+  ASSERT_TRUE(LoadAndConnect("unregistered"));
+  const auto centroids = [this](const std::string& name, int scan, bool is_registered) {
+    ros::Publisher publisher = nh_.advertise<sensor_msgs::PointCloud2>("/" + name + "/points", 10);
+    std::vector<SegmentArray> got;
+    ros::Subscriber subscriber = nh_.subscribe<SegmentArray>(
+        "/" + name + "/segments", 10, [&got](const SegmentArrayConstPtr& m) { got.push_back(*m); });
+    EXPECT_TRUE(WaitFor([&] { return publisher.getNumSubscribers() > 0 && subscriber.getNumPublishers() > 0; }));
+    PublishTf(scan, "lidar_f");
+    sensor_msgs::PointCloud2 cloud = drive_->Cloud(scan, "lidar_f");
+    if (is_registered) {
+      std::vector<ColouredPoint> points;
+      for (const Eigen::Vector3f& p : drive_->Scan(scan))
+        points.push_back({(drive_->T_odom_sensor(scan) * p.cast<double>()).cast<float>(), 0});
+      cloud = ToPointCloud2(points, cloud.header);
+      cloud.header.frame_id = "odom";
+    }
+    publisher.publish(cloud);
+    EXPECT_TRUE(WaitFor([&] { return !got.empty(); }, 5.0));
+    std::vector<Eigen::Vector3d> result;
+    if (!got.empty())
+      for (const Segment& segment : got[0].changed) result.push_back(ToVector(segment.centroid));
+    return result;
+  };
+  const std::vector<Eigen::Vector3d> registered = centroids("registered", 10, true);
+  const std::vector<Eigen::Vector3d> unregistered = centroids("unregistered", 10, false);
+  ASSERT_GT(registered.size(), 5u);
+  ASSERT_EQ(registered.size(), unregistered.size());
+  for (const Eigen::Vector3d& centroid : registered)
+    EXPECT_TRUE(std::any_of(unregistered.begin(), unregistered.end(),
+                            [&](const Eigen::Vector3d& other) { return (other - centroid).norm() < 0.01; }));
+}
+
+struct WrongParameter {
+  std::string nodelet;
+  std::string type;
+  std::string words;
+};
+
+TEST_F(BadInput, WrongParametersAreFatalByNameAndTheManagerLives) {
+  ros::param::set("/wrong_1/colour", "red");
+  ros::param::set("/wrong_2/front_end/grid/resolution", 0.1);
+  ros::param::set("/wrong_3/queue_size", "many");
+  ros::param::set("/wrong_4/config_file", "/no/such/file.yaml");
+  ros::param::set("/wrong_5/front_end/local_radius_m", -3.0);
+  ros::param::set("/wrong_6/display_hight_m", 1.0);
+  ros::param::set("/wrong_7/pose_graph/sigma", 1.0);
+  const std::string front_end = "incremental_segmatch/FrontEndNodelet";
+  const std::vector<WrongParameter> wrong{
+      {"wrong_1", front_end, "unknown parameter /wrong_1/colour"},
+      {"wrong_2", front_end, "grid.resolution"},
+      {"wrong_3", front_end, "/wrong_3/queue_size: expected an integer"},
+      {"wrong_4", front_end, "/no/such/file.yaml"},
+      {"wrong_5", front_end, "local_radius_m"},
+      {"wrong_6", "incremental_segmatch/BackEndNodelet", "unknown parameter /wrong_6/display_hight_m"},
+      {"wrong_7", "incremental_segmatch/PoseGraphNodelet", "unknown parameter /wrong_7/pose_graph/sigma"}};
+  for (const WrongParameter& w : wrong) {
+    ASSERT_TRUE(Load(w.nodelet, w.type)) << w.nodelet;
+    EXPECT_TRUE(Hears(w.words, rosgraph_msgs::Log::FATAL));
+  }
+  nodelet::NodeletList list;
+  ASSERT_TRUE(ros::service::call("/manager/list", list));
+  EXPECT_GE(list.response.nodelets.size(), wrong.size());
+}
+
+}  // namespace
+}  // namespace incremental_segmatch
+
+int main(int argc, char** argv) {
+  testing::InitGoogleTest(&argc, argv);
+  ros::init(argc, argv, "bad_input_test");
+  ros::NodeHandle nh;  // keeps the node alive between tests
+  return RUN_ALL_TESTS();
+}
