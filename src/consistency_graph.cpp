@@ -4,9 +4,9 @@
 #include <array>
 #include <chrono>
 #include <cmath>
-#include <optional>
 #include <stdexcept>
 #include <string>
+#include <tuple>
 
 #include "radix_sort.hpp"
 
@@ -92,7 +92,7 @@ struct ScreenArrays {
   float factor = 0.f;                             ///< 2 tol^2
 };
 
-constexpr std::size_t kLanes = 8;
+constexpr std::uint32_t kLanes = 8;
 
 struct Bounds {
   Eigen::Vector3d low = Eigen::Vector3d::Constant(kInfinity);
@@ -135,27 +135,34 @@ ScreenArrays MakeScreenArrays(const std::vector<Match>& matches, const Bounds& l
   return arrays;
 }
 
-/// Writes those of [begin, end) that may be within the tolerance of i to `hits` and returns their number.
-std::size_t ScreenPortable(const ScreenArrays& arrays, std::size_t i, std::size_t begin, std::size_t end,
+/// Indices begin to end - 1.
+struct Range {
+  std::uint32_t begin, end;
+};
+
+/// Writes those in the ranges that may be within the tolerance of i to `hits` and returns their number.
+std::size_t ScreenPortable(const ScreenArrays& arrays, std::uint32_t i, const std::vector<Range>& ranges,
                            std::uint32_t* hits) {
   const auto& c = arrays.coordinates;
   std::size_t count = 0;
-  for (std::size_t j = begin; j < end; ++j) {
-    const float lx = c[0][j] - c[0][i], ly = c[1][j] - c[1][i], lz = c[2][j] - c[2][i];
-    const float tx = c[3][j] - c[3][i], ty = c[4][j] - c[4][i], tz = c[5][j] - c[5][i];
-    const float local = lx * lx + ly * ly + lz * lz;
-    const float target = tx * tx + ty * ty + tz * tz;
-    const float difference = local - target;
-    hits[count] = static_cast<std::uint32_t>(j);
-    count += difference * difference <= arrays.factor * (local + target) ? 1 : 0;
+  for (const Range range : ranges) {
+    for (std::uint32_t j = range.begin; j < range.end; ++j) {
+      const float lx = c[0][j] - c[0][i], ly = c[1][j] - c[1][i], lz = c[2][j] - c[2][i];
+      const float tx = c[3][j] - c[3][i], ty = c[4][j] - c[4][i], tz = c[5][j] - c[5][i];
+      const float local = lx * lx + ly * ly + lz * lz;
+      const float target = tx * tx + ty * ty + tz * tz;
+      const float difference = local - target;
+      hits[count] = j;
+      count += difference * difference <= arrays.factor * (local + target) ? 1 : 0;
+    }
   }
   return count;
 }
 
 #ifdef SEGMATCH_HAS_AVX2_KERNEL
 /// The same as ScreenPortable, eight at a time.
-__attribute__((target("avx2"))) std::size_t ScreenAvx2(const ScreenArrays& arrays, std::size_t i, std::size_t begin,
-                                                       std::size_t end, std::uint32_t* hits) {
+__attribute__((target("avx2"))) std::size_t ScreenAvx2(const ScreenArrays& arrays, std::uint32_t i,
+                                                       const std::vector<Range>& ranges, std::uint32_t* hits) {
   const float* const lx = arrays.coordinates[0].data();
   const float* const ly = arrays.coordinates[1].data();
   const float* const lz = arrays.coordinates[2].data();
@@ -166,29 +173,29 @@ __attribute__((target("avx2"))) std::size_t ScreenAvx2(const ScreenArrays& array
   const __m256 tx_i = _mm256_set1_ps(tx[i]), ty_i = _mm256_set1_ps(ty[i]), tz_i = _mm256_set1_ps(tz[i]);
   const __m256 factor = _mm256_set1_ps(arrays.factor);
   std::size_t count = 0;
-  for (std::size_t j = begin; j < end; j += kLanes) {
-    const __m256 a = _mm256_sub_ps(_mm256_loadu_ps(lx + j), lx_i);
-    const __m256 b = _mm256_sub_ps(_mm256_loadu_ps(ly + j), ly_i);
-    const __m256 c = _mm256_sub_ps(_mm256_loadu_ps(lz + j), lz_i);
-    const __m256 d = _mm256_sub_ps(_mm256_loadu_ps(tx + j), tx_i);
-    const __m256 e = _mm256_sub_ps(_mm256_loadu_ps(ty + j), ty_i);
-    const __m256 f = _mm256_sub_ps(_mm256_loadu_ps(tz + j), tz_i);
-    const __m256 local = _mm256_add_ps(_mm256_add_ps(_mm256_mul_ps(a, a), _mm256_mul_ps(b, b)), _mm256_mul_ps(c, c));
-    const __m256 target = _mm256_add_ps(_mm256_add_ps(_mm256_mul_ps(d, d), _mm256_mul_ps(e, e)), _mm256_mul_ps(f, f));
-    const __m256 difference = _mm256_sub_ps(local, target);
-    const __m256 near = _mm256_cmp_ps(_mm256_mul_ps(difference, difference),
-                                      _mm256_mul_ps(factor, _mm256_add_ps(local, target)), _CMP_LE_OQ);
-    unsigned mask = static_cast<unsigned>(_mm256_movemask_ps(near));
-    if (end - j < kLanes) mask &= (1u << (end - j)) - 1u;
-    for (; mask != 0; mask &= mask - 1) {
-      hits[count++] = static_cast<std::uint32_t>(j) + static_cast<std::uint32_t>(__builtin_ctz(mask));
+  for (const Range range : ranges) {
+    for (std::uint32_t j = range.begin; j < range.end; j += kLanes) {
+      const __m256 a = _mm256_sub_ps(_mm256_loadu_ps(lx + j), lx_i);
+      const __m256 b = _mm256_sub_ps(_mm256_loadu_ps(ly + j), ly_i);
+      const __m256 c = _mm256_sub_ps(_mm256_loadu_ps(lz + j), lz_i);
+      const __m256 d = _mm256_sub_ps(_mm256_loadu_ps(tx + j), tx_i);
+      const __m256 e = _mm256_sub_ps(_mm256_loadu_ps(ty + j), ty_i);
+      const __m256 f = _mm256_sub_ps(_mm256_loadu_ps(tz + j), tz_i);
+      const __m256 local = _mm256_add_ps(_mm256_add_ps(_mm256_mul_ps(a, a), _mm256_mul_ps(b, b)), _mm256_mul_ps(c, c));
+      const __m256 target = _mm256_add_ps(_mm256_add_ps(_mm256_mul_ps(d, d), _mm256_mul_ps(e, e)), _mm256_mul_ps(f, f));
+      const __m256 difference = _mm256_sub_ps(local, target);
+      const __m256 near = _mm256_cmp_ps(_mm256_mul_ps(difference, difference),
+                                        _mm256_mul_ps(factor, _mm256_add_ps(local, target)), _CMP_LE_OQ);
+      unsigned mask = static_cast<unsigned>(_mm256_movemask_ps(near));
+      if (range.end - j < kLanes) mask &= (1u << (range.end - j)) - 1u;
+      for (; mask != 0; mask &= mask - 1) hits[count++] = j + static_cast<std::uint32_t>(__builtin_ctz(mask));
     }
   }
   return count;
 }
 #endif
 
-using ScreenFunction = std::size_t (*)(const ScreenArrays&, std::size_t, std::size_t, std::size_t, std::uint32_t*);
+using ScreenFunction = std::size_t (*)(const ScreenArrays&, std::uint32_t, const std::vector<Range>&, std::uint32_t*);
 
 ScreenFunction ChooseScreen(bool use_avx2) {
 #ifdef SEGMATCH_HAS_AVX2_KERNEL
@@ -224,15 +231,12 @@ class Partition {
   std::uint64_t ForEachPairOf(Selected selected, Visit visit);
 
  private:
+  using Index = std::int64_t;  ///< of a cell along an axis
   struct Row {
-    std::uint64_t key;           ///< z and y of its cells
-    std::uint32_t begin, end;    ///< its slots
-    std::uint64_t first_column;  ///< of the cells in its table
-    std::size_t columns;
-    std::size_t table;  ///< where its cells start in cell_begin_
-  };
-  struct Range {
-    std::uint32_t begin, end;
+    Index y, z;                ///< of its cells
+    std::uint32_t begin, end;  ///< its slots
+    Index first_column, last_column;
+    std::size_t table;  ///< where the columns' first slots stand in column_begin_
   };
   /// A row within reach and by how many rows it is away.
   struct NearRow {
@@ -242,28 +246,30 @@ class Partition {
 
   static constexpr int kReach = 4;  ///< squares of side b + tolerance, divided by this
 
-  static std::uint64_t RowKey(std::uint64_t y, std::uint64_t z) { return (z << 32) | y; }
-  std::uint64_t Cell(double offset_m) const { return static_cast<std::uint64_t>(std::max(offset_m, 0.0) / side_m_); }
-  std::uint64_t Column(double offset_m) const { return Cell(offset_m) >> column_shift_; }
+  Index Cell(double offset_m) const { return static_cast<Index>(std::max(offset_m, 0.0) * cells_per_m_); }
+  static std::uint64_t RowKey(Index y, Index z) {
+    return (static_cast<std::uint64_t>(z) << 32) | static_cast<std::uint64_t>(y);
+  }
   void SortIntoRows(const std::vector<Match>& matches);
-  void FillTables(const std::vector<std::uint64_t>& columns);
+  void FillColumns(const std::vector<std::uint64_t>& column_of);
   std::vector<NearRow> RowsNear(const Row& row, bool only_later) const;
-  double Gap(std::uint64_t cell, int step, double offset_m) const;
+  double Gap(Index cell, int step, double offset_m) const;
   Range RangeIn(const NearRow& near, const Row& own, std::uint32_t slot) const;
   template <typename Visit>
-  std::uint64_t ScreenRange(std::uint32_t slot, Range range, Visit& visit);
+  std::uint64_t Screen(std::uint32_t slot, const std::vector<Range>& ranges, Visit& visit);
 
   Layout layout_;
   ScreenFunction screen_;
   double slack_m_ = 0.0;  ///< covers the rounding of the grid's arithmetic
   double side_m_ = 1.0;
+  double cells_per_m_ = 1.0;
   int column_shift_ = 0;  ///< columns are 2^shift cells wide, so that tables stay small however far targets lie apart
   Eigen::Vector3d origin_ = Eigen::Vector3d::Zero();
-  std::vector<std::uint32_t> order_;  ///< slot to index
-  std::vector<Match> matches_;        ///< by slot
-  std::vector<double> reach_m_;       ///< by slot: no consistent target is farther away
-  std::vector<Row> rows_;             ///< by key
-  std::vector<std::uint32_t> cell_begin_;
+  std::vector<std::uint32_t> order_;         ///< slot to index
+  std::vector<Match> matches_;               ///< by slot
+  std::vector<double> reach_m_;              ///< by slot: no consistent target is farther away
+  std::vector<Row> rows_;                    ///< by z, then y
+  std::vector<std::uint32_t> column_begin_;  ///< first slot of each column of each row
   ScreenArrays arrays_;
   std::vector<std::uint32_t> hits_;
 };
@@ -284,6 +290,7 @@ Partition::Partition(const std::vector<Match>& matches, double tolerance_m, Layo
     for (const Match& match : matches) farthest_m = std::max(farthest_m, Distance(match.local, middle));
     side_m_ = (2.0 * farthest_m + tolerance_m + 8.0 * slack_m_) * (1.0 + 1e-9) / kReach;
     side_m_ = std::max(side_m_, target.half_extent() / (1 << 28));
+    cells_per_m_ = 1.0 / side_m_;
     SortIntoRows(matches);
     reach_m_.reserve(matches_.size());
     for (const Match& match : matches_) {
@@ -301,7 +308,7 @@ void Partition::SortIntoRows(const std::vector<Match>& matches) {
   if (layout_ != Layout::kOneCell) {
     for (std::size_t i = 0; i < matches.size(); ++i) {
       const Eigen::Vector3d offset = matches[i].target - origin_;
-      column_of[i] = Cell(offset.x());
+      column_of[i] = static_cast<std::uint64_t>(Cell(offset.x()));
       row_of[i] = RowKey(Cell(offset.y()), layout_ == Layout::kCubes ? Cell(offset.z()) : 0);
     }
     order_ = SortedByKey(SortedByKey(std::move(order_), column_of), row_of);
@@ -311,93 +318,102 @@ void Partition::SortIntoRows(const std::vector<Match>& matches) {
 
   for (std::uint32_t slot = 0; slot < order_.size(); ++slot) {
     const std::uint64_t key = row_of[order_[slot]];
-    if (rows_.empty() || rows_.back().key != key) rows_.push_back({key, slot, slot, column_of[order_[slot]], 0, 0});
+    const auto column = static_cast<Index>(column_of[order_[slot]]);
+    if (rows_.empty() || RowKey(rows_.back().y, rows_.back().z) != key) {
+      rows_.push_back({static_cast<Index>(key & 0xffffffffu), static_cast<Index>(key >> 32), slot, slot, column, 0, 0});
+    }
     rows_.back().end = slot + 1;
+    rows_.back().last_column = column;
   }
-  FillTables(column_of);
+  FillColumns(column_of);
 }
 
-void Partition::FillTables(const std::vector<std::uint64_t>& columns) {
-  const auto last_column = [&](const Row& row) { return columns[order_[row.end - 1]]; };
+void Partition::FillColumns(const std::vector<std::uint64_t>& column_of) {
   const std::size_t limit = 8 * order_.size() + 4096;
   for (column_shift_ = 0;; ++column_shift_) {
     std::size_t total = 0;
-    for (const Row& row : rows_) total += (last_column(row) >> column_shift_) - (row.first_column >> column_shift_) + 2;
+    for (const Row& row : rows_) {
+      total += static_cast<std::size_t>((row.last_column >> column_shift_) - (row.first_column >> column_shift_)) + 2;
+    }
     if (total <= limit) break;
   }
   for (Row& row : rows_) {
-    row.columns = (last_column(row) >> column_shift_) - (row.first_column >> column_shift_) + 1;
     row.first_column >>= column_shift_;
-    row.table = cell_begin_.size();
+    row.last_column >>= column_shift_;
+    row.table = column_begin_.size();
     for (std::uint32_t slot = row.begin; slot < row.end; ++slot) {
-      const std::size_t column = (columns[order_[slot]] >> column_shift_) - row.first_column;
-      while (cell_begin_.size() <= row.table + column) cell_begin_.push_back(slot);
+      const Index column = static_cast<Index>(column_of[order_[slot]]) >> column_shift_;
+      const std::size_t needed = row.table + static_cast<std::size_t>(column - row.first_column) + 1;
+      if (column_begin_.size() < needed) column_begin_.resize(needed, slot);
     }
-    cell_begin_.push_back(row.end);
+    column_begin_.push_back(row.end);
   }
 }
 
 std::vector<Partition::NearRow> Partition::RowsNear(const Row& row, bool only_later) const {
   std::vector<NearRow> near;
-  const auto y = static_cast<std::int64_t>(row.key & 0xffffffffu);
-  const auto z = static_cast<std::int64_t>(row.key >> 32);
   const int reach_z = layout_ == Layout::kCubes ? kReach : 0;
   const int reach_y = layout_ == Layout::kOneCell ? 0 : kReach;
   for (int dz = only_later ? 0 : -reach_z; dz <= reach_z; ++dz) {
     for (int dy = only_later && dz == 0 ? 0 : -reach_y; dy <= reach_y; ++dy) {
-      if (z + dz < 0 || y + dy < 0) continue;
-      const std::uint64_t key = RowKey(static_cast<std::uint64_t>(y + dy), static_cast<std::uint64_t>(z + dz));
-      const auto found =
-          std::lower_bound(rows_.begin(), rows_.end(), key, [](const Row& a, std::uint64_t b) { return a.key < b; });
-      if (found != rows_.end() && found->key == key) near.push_back({&*found, dy, dz});
+      if (row.z + dz < 0 || row.y + dy < 0) continue;
+      const std::uint64_t key = RowKey(row.y + dy, row.z + dz);
+      const auto found = std::lower_bound(rows_.begin(), rows_.end(), key,
+                                          [](const Row& a, std::uint64_t b) { return RowKey(a.y, a.z) < b; });
+      if (found != rows_.end() && RowKey(found->y, found->z) == key) near.push_back({&*found, dy, dz});
     }
   }
   return near;
 }
 
 /// Lower bound of the distance along one axis to the cells `step` away.
-double Partition::Gap(std::uint64_t cell, int step, double offset_m) const {
+double Partition::Gap(Index cell, int step, double offset_m) const {
   if (step == 0) return 0.0;
-  const double index = static_cast<double>(static_cast<std::int64_t>(cell) + step);
+  const auto index = static_cast<double>(cell + step);
   const double gap = step > 0 ? index * side_m_ - offset_m : offset_m - (index + 1.0) * side_m_;
   return std::max(gap - slack_m_, 0.0);
 }
 
-Partition::Range Partition::RangeIn(const NearRow& near, const Row& own, std::uint32_t slot) const {
+Range Partition::RangeIn(const NearRow& near, const Row& own, std::uint32_t slot) const {
   const Row& row = *near.row;
   if (layout_ == Layout::kOneCell) return {row.begin, row.end};
-  const Eigen::Vector3d offset = matches_[slot].target - origin_;
-  const double gap_y = Gap(own.key & 0xffffffffu, near.dy, offset.y());
-  const double gap_z = Gap(own.key >> 32, near.dz, offset.z());
+  const Eigen::Vector3d& target = matches_[slot].target;
+  const double gap_y = Gap(own.y, near.dy, target.y() - origin_.y());
+  const double gap_z = Gap(own.z, near.dz, target.z() - origin_.z());
   const double width_sq = reach_m_[slot] * reach_m_[slot] - gap_y * gap_y - gap_z * gap_z;
   if (width_sq < 0.0) return {0, 0};
   const double width = std::sqrt(width_sq) + slack_m_;
-  const std::uint64_t low = std::max(Column(offset.x() - width), row.first_column);
-  const std::uint64_t high = std::min(Column(offset.x() + width), row.first_column + row.columns - 1);
+  const double x = target.x() - origin_.x();
+  const Index low = std::max(Cell(x - width) >> column_shift_, row.first_column);
+  const Index high = std::min(Cell(x + width) >> column_shift_, row.last_column);
   if (low > high) return {0, 0};
-  const std::uint32_t* const table = cell_begin_.data() + row.table;
-  return {table[low - row.first_column], table[high - row.first_column + 1]};
+  const std::uint32_t* const table = column_begin_.data() + row.table - row.first_column;
+  return {table[low], table[high + 1]};
 }
 
 template <typename Visit>
-std::uint64_t Partition::ScreenRange(std::uint32_t slot, Range range, Visit& visit) {
-  if (range.begin >= range.end) return 0;
-  const std::size_t count = screen_(arrays_, slot, range.begin, range.end, hits_.data());
+std::uint64_t Partition::Screen(std::uint32_t slot, const std::vector<Range>& ranges, Visit& visit) {
+  const std::size_t count = screen_(arrays_, slot, ranges, hits_.data());
   for (std::size_t k = 0; k < count; ++k) visit(slot, hits_[k]);
-  return range.end - range.begin;
+  std::uint64_t screened = 0;
+  for (const Range range : ranges) screened += range.end - range.begin;
+  return screened;
 }
 
 template <typename Visit>
 std::uint64_t Partition::ForEachPair(Visit visit) {
   std::uint64_t screened = 0;
+  std::vector<Range> ranges;
   for (const Row& row : rows_) {
     const std::vector<NearRow> rows_near = RowsNear(row, true);
     for (std::uint32_t slot = row.begin; slot < row.end; ++slot) {
+      ranges.clear();
       for (const NearRow& near : rows_near) {
         Range range = RangeIn(near, row, slot);
-        if (near.row == &row) range.begin = std::max(range.begin, slot + 1);
-        screened += ScreenRange(slot, range, visit);
+        if (near.row == &row) range.begin = slot + 1;  // those before it have visited it
+        if (range.begin < range.end) ranges.push_back(range);
       }
+      screened += Screen(slot, ranges, visit);
     }
   }
   return screened;
@@ -406,11 +422,14 @@ std::uint64_t Partition::ForEachPair(Visit visit) {
 template <typename Selected, typename Visit>
 std::uint64_t Partition::ForEachPairOf(Selected selected, Visit visit) {
   std::uint64_t screened = 0;
+  std::vector<Range> ranges;
   for (const Row& row : rows_) {
     const std::vector<NearRow> rows_near = RowsNear(row, false);
     for (std::uint32_t slot = row.begin; slot < row.end; ++slot) {
       if (!selected(slot)) continue;
-      for (const NearRow& near : rows_near) screened += ScreenRange(slot, RangeIn(near, row, slot), visit);
+      ranges.clear();
+      for (const NearRow& near : rows_near) ranges.push_back(RangeIn(near, row, slot));
+      screened += Screen(slot, ranges, visit);
     }
   }
   return screened;
@@ -604,6 +623,55 @@ void Cache::FindNewCandidates(std::vector<ConsistencyGraph::Edge>& edges) {
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
+// Choice of the method
+
+/// Picks the method with the smallest cost per correspondence, and tries each of them once in a while.
+class MethodChooser {
+ public:
+  /// The method for the next call.
+  ConsistencyMethod Next(std::size_t correspondences) {
+    // The cache is only worth measuring on the second of two calls; the first one fills it.
+    static constexpr std::array<ConsistencyMethod, 5> kTrials{
+        ConsistencyMethod::kPartitioned2D, ConsistencyMethod::kPartitioned3D, ConsistencyMethod::kAllPairs,
+        ConsistencyMethod::kCached, ConsistencyMethod::kCached};
+    constexpr std::size_t kCallsBetweenTrials = 64;
+    const std::size_t turn = calls_++ % kCallsBetweenTrials;
+    const ConsistencyMethod best = Best(correspondences);
+    const ConsistencyMethod next = turn < kTrials.size() ? kTrials[turn] : best;
+    return IsCandidate(next, correspondences) ? next : best;
+  }
+
+  void Report(ConsistencyMethod method, double cost) {
+    constexpr double kNewWeight = 0.5;
+    const bool filled_the_cache = method == ConsistencyMethod::kCached && last_ != ConsistencyMethod::kCached;
+    last_ = method;
+    if (filled_the_cache) return;
+    double& known = cost_[static_cast<std::size_t>(method)];
+    known = known == kInfinity ? cost : kNewWeight * cost + (1.0 - kNewWeight) * known;
+  }
+
+ private:
+  static bool IsCandidate(ConsistencyMethod method, std::size_t correspondences) {
+    constexpr std::size_t kMostForAllPairs = 1000;
+    return method != ConsistencyMethod::kAllPairs || correspondences <= kMostForAllPairs;
+  }
+
+  ConsistencyMethod Best(std::size_t correspondences) const {
+    auto best = ConsistencyMethod::kPartitioned2D;
+    for (const auto method :
+         {ConsistencyMethod::kAllPairs, ConsistencyMethod::kPartitioned3D, ConsistencyMethod::kCached}) {
+      if (IsCandidate(method, correspondences) && Cost(method) < Cost(best)) best = method;
+    }
+    return best;
+  }
+  double Cost(ConsistencyMethod method) const { return cost_[static_cast<std::size_t>(method)]; }
+
+  std::array<double, 4> cost_{kInfinity, kInfinity, kInfinity, kInfinity};  ///< per correspondence, by method
+  ConsistencyMethod last_ = ConsistencyMethod::kAuto;
+  std::size_t calls_ = 0;
+};
+
+// ---------------------------------------------------------------------------------------------------------------------
 
 void Validate(const ConsistencyParameters& parameters) {
   const auto require = [](bool good, const char* message) {
@@ -703,10 +771,16 @@ class ConsistencyGraphBuilder::Impl {
 
   ConsistencyParameters parameters_;
   Cache cache_;
+  MethodChooser chooser_;
 };
 
 ConsistencyGraph ConsistencyGraphBuilder::Impl::BuildWithFastest(const Correspondences& correspondences) {
-  return BuildWith(ConsistencyMethod::kPartitioned2D, correspondences);
+  const ConsistencyMethod method = chooser_.Next(correspondences.size());
+  const auto start = std::chrono::steady_clock::now();
+  ConsistencyGraph graph = BuildWith(method, correspondences);
+  const std::chrono::duration<double> seconds = std::chrono::steady_clock::now() - start;
+  chooser_.Report(method, seconds.count() / static_cast<double>(correspondences.size() + 1));
+  return graph;
 }
 
 ConsistencyGraphBuilder::ConsistencyGraphBuilder(const ConsistencyParameters& parameters) {

@@ -217,7 +217,7 @@ void Search::Expand(Word* candidates) {
 /// The vertices of a graph that are in a core of some order, renumbered in degeneracy order.
 class CoreGraph {
  public:
-  CoreGraph(const ConsistencyGraph& graph, std::size_t min_core);
+  CoreGraph(const ConsistencyGraph& whole, std::size_t min_core);
 
   std::size_t size() const { return names_.size(); }
   std::uint32_t name(std::uint32_t v) const { return names_[v]; }  ///< in the original graph
@@ -238,25 +238,52 @@ class CoreGraph {
   Vertices neighbours_;
 };
 
-CoreGraph::CoreGraph(const ConsistencyGraph& graph, std::size_t min_core) {
+/// The subgraph of the vertices for which keep(v), and their numbers in the whole graph.
+template <typename Keep>
+std::pair<ConsistencyGraph, Vertices> Subgraph(const ConsistencyGraph& graph, Keep keep) {
+  constexpr std::uint32_t kDropped = std::numeric_limits<std::uint32_t>::max();
+  Vertices new_index(graph.vertices(), kDropped);
+  Vertices names;
+  for (std::uint32_t v = 0; v < graph.vertices(); ++v) {
+    if (!keep(v)) continue;
+    new_index[v] = static_cast<std::uint32_t>(names.size());
+    names.push_back(v);
+  }
+  ConsistencyGraph subgraph;
+  for (const std::uint32_t v : names) {
+    for (const std::uint32_t u : graph.Neighbours(v)) {
+      if (new_index[u] != kDropped) subgraph.neighbours.push_back(new_index[u]);
+    }
+    subgraph.offsets.push_back(subgraph.neighbours.size());
+  }
+  subgraph.edges = subgraph.neighbours.size() / 2;
+  return {std::move(subgraph), std::move(names)};
+}
+
+CoreGraph::CoreGraph(const ConsistencyGraph& whole, std::size_t min_core) {
+  // Most vertices of a sparse graph have too low a degree: without them the rest is cheap.
+  const auto [graph, whole_name] =
+      Subgraph(whole, [&](std::uint32_t v) { return whole.Neighbours(v).size() >= min_core; });
   constexpr std::uint32_t kDropped = std::numeric_limits<std::uint32_t>::max();
   const DegeneracyOrder degeneracy = ComputeDegeneracyOrder(graph);
   Vertices new_index(graph.vertices(), kDropped);
+  Vertices ordered;
   for (const std::uint32_t v : degeneracy.order) {
     if (degeneracy.core[v] < min_core) continue;
-    new_index[v] = static_cast<std::uint32_t>(names_.size());
-    names_.push_back(v);
+    new_index[v] = static_cast<std::uint32_t>(ordered.size());
+    ordered.push_back(v);
+    names_.push_back(whole_name[v]);
     core_.push_back(degeneracy.core[v]);
   }
-  for (const std::uint32_t name : names_) {
+  for (const std::uint32_t v : ordered) {
     std::size_t degree = 0;
-    for (const std::uint32_t u : graph.Neighbours(name)) degree += new_index[u] != kDropped ? 1 : 0;
+    for (const std::uint32_t u : graph.Neighbours(v)) degree += new_index[u] != kDropped ? 1 : 0;
     offsets_.push_back(offsets_.back() + degree);
   }
   neighbours_.resize(offsets_.back());
   std::vector<std::size_t> next(offsets_.begin(), offsets_.end() - 1);
-  for (std::uint32_t v = 0; v < names_.size(); ++v) {
-    for (const std::uint32_t u : graph.Neighbours(names_[v])) {
+  for (std::uint32_t v = 0; v < ordered.size(); ++v) {
+    for (const std::uint32_t u : graph.Neighbours(ordered[v])) {
       if (new_index[u] != kDropped) neighbours_[next[new_index[u]]++] = v;
     }
   }

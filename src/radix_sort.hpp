@@ -13,19 +13,28 @@ namespace incremental_segmatch {
 /// share.
 inline std::vector<std::uint32_t> SortedByKey(std::vector<std::uint32_t> order,
                                               const std::vector<std::uint64_t>& keys) {
+  struct Entry {
+    std::uint64_t key;
+    std::uint32_t index;
+  };
   if (order.empty()) return order;
+  std::vector<Entry> entries, sorted(order.size());
+  entries.reserve(order.size());
   std::uint64_t varying_bits = 0;
-  for (const std::uint32_t i : order) varying_bits |= keys[i] ^ keys[order.front()];
-  std::vector<std::uint32_t> sorted(order.size());
+  for (const std::uint32_t i : order) {
+    entries.push_back({keys[i], i});
+    varying_bits |= keys[i] ^ entries.front().key;
+  }
   for (int shift = 0; shift < 64; shift += 8) {
     if (((varying_bits >> shift) & 0xff) == 0) continue;
     std::array<std::uint32_t, 256> begin{};
-    for (const std::uint32_t i : order) ++begin[(keys[i] >> shift) & 0xff];
+    for (const Entry& entry : entries) ++begin[(entry.key >> shift) & 0xff];
     std::uint32_t total = 0;
     for (std::uint32_t& count : begin) total += std::exchange(count, total);
-    for (const std::uint32_t i : order) sorted[begin[(keys[i] >> shift) & 0xff]++] = i;
-    order.swap(sorted);
+    for (const Entry& entry : entries) sorted[begin[(entry.key >> shift) & 0xff]++] = entry;
+    entries.swap(sorted);
   }
+  for (std::size_t i = 0; i < order.size(); ++i) order[i] = entries[i].index;
   return order;
 }
 
