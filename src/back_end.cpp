@@ -32,7 +32,8 @@ Covariance6 CovarianceAtQuery(const Covariance6& covariance_map, const Pose& T_m
   adjoint.topLeftCorner<3, 3>() = R;
   adjoint.topRightCorner<3, 3>() = t_cross * R;
   adjoint.bottomRightCorner<3, 3>() = R;
-  return adjoint * covariance_map * adjoint.transpose();
+  const Covariance6 covariance = adjoint * covariance_map * adjoint.transpose();
+  return 0.5 * (covariance + covariance.transpose());
 }
 
 }  // namespace
