@@ -71,8 +71,9 @@ else
   # A master of its own, so that nothing else that runs here is disturbed.
   port=$(python3 -c 'import socket; s = socket.socket(); s.bind(("localhost", 0)); print(s.getsockname()[1])')
   export ROS_MASTER_URI=http://localhost:$port ROS_HOSTNAME=localhost ROS_LOG_DIR=$cache/log
-  rm -rf "$out" "$ROS_LOG_DIR"
+  rm -rf "$ROS_LOG_DIR"
   mkdir -p "$out" "$ROS_LOG_DIR"
+  rm -f "$out"/{played,closures.csv,trajectory_odometry.tum,trajectory_optimized.tum,pose_graph.g2o}
   seconds=$(awk -v rate="$rate" 'END {printf "%.0f", $1 / rate}' "$drive/sequences/00/times.txt")
   echo "Playing the drive, which takes $seconds s (ROS_MASTER_URI=$ROS_MASTER_URI) ..."
   roslaunch -p "$port" incremental_segmatch demo.launch bag:="$bag" out:="$out" rate:="$rate" rviz:="$rviz"

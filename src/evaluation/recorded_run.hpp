@@ -24,8 +24,8 @@ RecordedRun ReadRecordedRun(const std::string& folder);
 
 /// How the trajectories of a run compare with the truth.
 struct RunErrors {
-  std::size_t poses = 0;             ///< of the run, each of which has a true one
-  double odometry_m = 0.0;           ///< root mean square position errors after alignment
+  std::size_t poses = 0;    ///< of the run, each of which has a true one
+  double odometry_m = 0.0;  ///< root mean square position errors after alignment
   double optimized_m = 0.0;
   double bound_same_places_m = 0.0;  ///< of the same graph whose closures are given their true relative poses
 };

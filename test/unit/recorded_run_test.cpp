@@ -55,8 +55,7 @@ class RecordedRunTest : public ::testing::Test {
     for (std::size_t i = 45; i < 80; i += 10) {
       const Pose T_target_query = drive_.truth[i - 40].inverse() * drive_.truth[i] * MakePose(0.1, 0.0, 0.0);
       const Covariance6 covariance = RandomCovariance(random);
-      EXPECT_TRUE(
-          graph.AddClosure(0, drive_.stamps_ns[i - 40], 0, drive_.stamps_ns[i], T_target_query, covariance));
+      EXPECT_TRUE(graph.AddClosure(0, drive_.stamps_ns[i - 40], 0, drive_.stamps_ns[i], T_target_query, covariance));
       rows_.push_back({drive_.stamps_ns[i], drive_.stamps_ns[i - 40], "a", "b", T_target_query, 9, 100, 0.25});
     }
     graph.Optimize();

@@ -20,7 +20,8 @@ int main(int, char** arguments) {
     std::snprintf(name, sizeof name, "%06d.bin", i);
     std::ifstream points(folder + "/velodyne/" + name, std::ios::binary);
     scan.points_sensor.clear();
-    for (float p[4]; points.read(reinterpret_cast<char*>(p), sizeof p);) scan.points_sensor.emplace_back(p[0], p[1], p[2]);
+    for (float p[4]; points.read(reinterpret_cast<char*>(p), sizeof p);)
+      scan.points_sensor.emplace_back(p[0], p[1], p[2]);
     const segmatch::FrontEndStep seen = front_end.Process(scan);
     const segmatch::BackEndStep recognized = back_end.Process(seen.delta);
     std::printf("scan %d: %zu segments", i, seen.counts.clusters.segments);
