@@ -1,6 +1,8 @@
 #include "incremental_segmatch/back_end.hpp"
 
+#include <Eigen/Eigenvalues>
 #include <algorithm>
+#include <cmath>
 #include <limits>
 #include <stdexcept>
 #include <utility>
@@ -36,6 +38,10 @@ Covariance6 CovarianceAtQuery(const Covariance6& covariance_map, const Pose& T_m
   return 0.5 * (covariance + covariance.transpose());
 }
 
+double LargestSigma(const Eigen::Matrix3d& covariance) {
+  return std::sqrt(std::max(0.0, Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d>(covariance, Eigen::EigenvaluesOnly).eigenvalues()[2]));
+}
+
 }  // namespace
 
 const char* ToString(StepEnd end) {
@@ -49,6 +55,9 @@ const char* ToString(StepEnd end) {
     case StepEnd::kTilted: return "tilted";
     case StepEnd::kLargeResidual: return "large_residual";
     case StepEnd::kNotRefined: return "not_refined";
+    case StepEnd::kAmbiguous: return "ambiguous";
+    case StepEnd::kUncovered: return "uncovered";
+    case StepEnd::kUncertain: return "uncertain";
   }
   return "unknown";
 }
@@ -68,6 +77,8 @@ BackEnd::BackEnd(const BackEndParameters& parameters, TargetMap map) : parameter
   if (!(matching.min_path_m >= 0.0)) throw std::invalid_argument("back_end.matching.min_path_m: must not be negative");
   if (!(matching.requery_distance >= 0.0))
     throw std::invalid_argument("back_end.matching.requery_distance: must not be negative");
+  Validate(parameters.refinement);
+  Validate(parameters.acceptance);
   Recognizer{parameters.recognizer};  // refuses what it does not accept now, not at the first recognition
   for (RobotIndex robot = 0; robot < map_.robots(); ++robot) {
     robots_.emplace_back();
@@ -101,18 +112,13 @@ BackEndStep BackEnd::Process(const SegmentDelta& delta) {
   step.counts.end = ToStepEnd(result.outcome);
   if (result.recognition) {
     Recognition recognition = *result.recognition;
-    if (parameters_.refinement.enabled) {
-      const std::optional<RefinedTransform> refined = Refine(robot, recognition);
-      if (refined) {
-        recognition.T_target_local = refined->T_target_local;
-        recognition.covariance = refined->covariance;
-      } else {
-        step.counts.end = StepEnd::kNotRefined;
-      }
-    }
+    Evidence evidence;
+    step.counts.end = RefineAndJudge(robot, &recognition, &evidence);
+    step.counts.evidence = evidence;
     if (step.counts.end == StepEnd::kRecognized) step.closure = MakeClosure(robot, delta.stamp_ns, recognition);
     if (step.closure) {
       step.closure->candidates = result.candidates;
+      step.closure->evidence = evidence;
       AcceptRecognition(robot, recognition);
     }
   }
@@ -343,6 +349,48 @@ const SegmentView& BackEnd::MatchedView(RobotIndex robot, const Correspondence& 
   for (const TargetCandidate& candidate : robots_[robot].local.at(inlier.local.id).candidates)
     if (candidate.segment == inlier.target) return map_.Find(inlier.target)->views[index_.view(candidate.item).view];
   throw std::logic_error("an inlier is none of the candidates");
+}
+
+/// Refines the transform on points, gathers the evidence and judges it.
+StepEnd BackEnd::RefineAndJudge(RobotIndex robot, Recognition* recognition, Evidence* evidence) const {
+  evidence->inliers = recognition->inliers.size();
+  evidence->runner_up = recognition->runner_up_size;
+  if (parameters_.refinement.enabled) {
+    const std::optional<RefinedTransform> refined = Refine(robot, *recognition);
+    if (!refined) return StepEnd::kNotRefined;
+    recognition->T_target_local = refined->T_target_local;
+    recognition->covariance = refined->covariance;
+    evidence->overlap = refined->overlap;
+  }
+  MeasureCoverage(robot, recognition->T_target_local, evidence);
+  const Covariance6 covariance =
+      CovarianceAtQuery(recognition->covariance, recognition->T_target_local * robots_[robot].T_odom_sensor);
+  evidence->sigma_m = LargestSigma(covariance.topLeftCorner<3, 3>());
+  evidence->sigma_rad = LargestSigma(covariance.bottomRightCorner<3, 3>());
+  switch (Judge(*evidence, parameters_.acceptance)) {
+    case Verdict::kAccepted: return StepEnd::kRecognized;
+    case Verdict::kAmbiguous: return StepEnd::kAmbiguous;
+    case Verdict::kUncovered: return StepEnd::kUncovered;
+    case Verdict::kUncertain: return StepEnd::kUncertain;
+  }
+  return StepEnd::kRecognized;
+}
+
+/// Holds all local segments, not the inliers alone, against the map around the recognised place.
+void BackEnd::MeasureCoverage(RobotIndex robot, const Pose& T_map_odom, Evidence* evidence) const {
+  std::vector<Eigen::Vector3d> local;
+  double reach_m = 0.0;
+  const Eigen::Vector3d place = T_map_odom * robots_[robot].T_odom_sensor.translation();
+  for (const auto& [id, segment] : robots_[robot].local) {
+    local.push_back(T_map_odom * segment.centroid_odom);
+    reach_m = std::max(reach_m, (local.back() - place).norm());
+  }
+  reach_m += parameters_.acceptance.neighbourhood_m;
+  std::vector<Eigen::Vector3d> target;
+  for (std::uint64_t item = 0; item < index_.next_item(); ++item)
+    if (index_.IsOpen(item, robot) && (index_.view(item).centroid_map - place).squaredNorm() <= reach_m * reach_m)
+      target.push_back(index_.view(item).centroid_map);
+  incremental_segmatch::MeasureCoverage(local, target, parameters_.acceptance, evidence);
 }
 
 std::optional<RefinedTransform> BackEnd::Refine(RobotIndex robot, const Recognition& recognition) const {

@@ -8,6 +8,7 @@
 #include <unordered_map>
 #include <vector>
 
+#include "incremental_segmatch/acceptance.hpp"
 #include "incremental_segmatch/point_refinement.hpp"
 #include "incremental_segmatch/recognizer.hpp"
 #include "incremental_segmatch/segment_delta.hpp"
@@ -36,6 +37,7 @@ struct BackEndParameters {
   MatchingParameters matching;
   RecognizerParameters recognizer;
   RefinementParameters refinement;
+  AcceptanceParameters acceptance;
   TargetMapParameters target_map;
 };
 
@@ -57,14 +59,15 @@ struct LoopClosure {
   Covariance6 covariance = Covariance6::Identity();    ///< of T_target_query, ROS's order, perturbation on the right: T exp(xi)
   std::size_t inliers = 0;
   std::size_t candidates = 0;
-  double rms_m = 0.0;
+  double rms_m = 0.0;                                  ///< residual of the inliers' centroids
+  Evidence evidence;
   Pose T_map_odom = Pose::Identity();                  ///< where this recognition puts the query's odom frame
   std::vector<SegmentMatch> matches;                   ///< the inliers
 };
 
 /// The stage that ended a step: why no loop here?
 enum class StepEnd { kRecognized, kNoSegments, kNoTargets, kTooFewCandidates, kCliqueTooSmall, kDegenerate, kTilted, kLargeResidual,
-                     kNotRefined };
+                     kNotRefined, kAmbiguous, kUncovered, kUncertain };
 const char* ToString(StepEnd end);
 
 /// The map side's part of the funnel.
@@ -77,6 +80,7 @@ struct BackEndCounts {
   std::size_t tested_pairs = 0;
   std::size_t edges = 0;
   std::size_t clique = 0;
+  std::optional<Evidence> evidence;     ///< of the recognition, accepted or not
   StepEnd end = StepEnd::kNoSegments;
 };
 
@@ -149,7 +153,9 @@ class BackEnd {
   std::map<RobotIndex, Correspondences> CollectCorrespondences(RobotIndex robot) const;
   RecognizerResult Recognize(RobotIndex robot, const std::map<RobotIndex, Correspondences>& by_frame);
   const SegmentView& MatchedView(RobotIndex robot, const Correspondence& inlier) const;
+  StepEnd RefineAndJudge(RobotIndex robot, Recognition* recognition, Evidence* evidence) const;
   std::optional<RefinedTransform> Refine(RobotIndex robot, const Recognition& recognition) const;
+  void MeasureCoverage(RobotIndex robot, const Pose& T_map_odom, Evidence* evidence) const;
   std::optional<LoopClosure> MakeClosure(RobotIndex robot, StampNs stamp_ns, const Recognition& recognition) const;
   void AcceptRecognition(RobotIndex robot, const Recognition& recognition);
   void JoinFrames(RobotIndex robot, RobotIndex target_robot, const Pose& T_map_odom);

@@ -61,6 +61,21 @@ std::vector<Column> CountColumns() {
           {"clique", [](const StepRecord& s) { return s.back_end.clique; }}};
 }
 
+// The evidence of the steps that had a recognition, accepted or not; empty fields in the others.
+struct EvidenceColumn {
+  std::string name;
+  std::function<double(const Evidence&)> value;
+};
+
+std::vector<EvidenceColumn> EvidenceColumns() {
+  return {{"runner_up", [](const Evidence& e) { return e.runner_up; }},
+          {"expected", [](const Evidence& e) { return e.expected; }},
+          {"supported", [](const Evidence& e) { return e.supported; }},
+          {"overlap", [](const Evidence& e) { return e.overlap; }},
+          {"sigma_m", [](const Evidence& e) { return e.sigma_m; }},
+          {"sigma_rad", [](const Evidence& e) { return e.sigma_rad; }}};
+}
+
 std::vector<double> Values(const std::vector<StepRecord>& steps,
                            const std::function<double(const StepRecord&)>& value) {
   std::vector<double> values;
@@ -117,7 +132,9 @@ void WriteStepsCsv(const std::vector<StepRecord>& steps, const std::string& path
   file << "step,stamp,total_ms";
   for (const std::string& stage : stages) file << ',' << stage << "_ms";
   file << ",read_ms,optimize_ms";
+  const std::vector<EvidenceColumn> evidence = EvidenceColumns();
   for (const Column& column : counts) file << ',' << column.name;
+  for (const EvidenceColumn& column : evidence) file << ',' << column.name;
   file << ",end\n";
   for (std::size_t i = 0; i < steps.size(); ++i) {
     const StepRecord& step = steps[i];
@@ -125,6 +142,10 @@ void WriteStepsCsv(const std::vector<StepRecord>& steps, const std::string& path
     for (const std::string& stage : stages) file << ',' << StageMs(step, stage);
     file << ',' << step.read_ms << ',' << step.optimize_ms;
     for (const Column& column : counts) file << ',' << static_cast<std::uint64_t>(column.value(step));
+    for (const EvidenceColumn& column : evidence) {
+      file << ',';
+      if (step.back_end.evidence) file << column.value(*step.back_end.evidence);
+    }
     file << ',' << ToString(step.back_end.end) << '\n';
   }
   file.close();

@@ -1,0 +1,39 @@
+#include "incremental_segmatch/acceptance.hpp"
+
+#include <algorithm>
+#include <limits>
+#include <stdexcept>
+#include <string>
+
+namespace incremental_segmatch {
+
+void MeasureCoverage(const std::vector<Eigen::Vector3d>& centroids_local, const std::vector<Eigen::Vector3d>& centroids_target,
+                     const AcceptanceParameters& parameters, Evidence* evidence) {
+  evidence->expected = evidence->supported = 0;
+  for (const Eigen::Vector3d& local : centroids_local) {
+    double nearest2 = std::numeric_limits<double>::infinity();
+    for (const Eigen::Vector3d& target : centroids_target) nearest2 = std::min(nearest2, (target - local).squaredNorm());
+    evidence->expected += nearest2 <= parameters.neighbourhood_m * parameters.neighbourhood_m;
+    evidence->supported += nearest2 <= parameters.support_distance_m * parameters.support_distance_m;
+  }
+}
+
+Verdict Judge(const Evidence& evidence, const AcceptanceParameters& parameters) {
+  if (evidence.inliers < evidence.runner_up + parameters.min_margin) return Verdict::kAmbiguous;
+  if (evidence.Coverage() < parameters.min_coverage) return Verdict::kUncovered;
+  if (evidence.sigma_m > parameters.max_sigma_m || evidence.sigma_rad > parameters.max_sigma_rad) return Verdict::kUncertain;
+  return Verdict::kAccepted;
+}
+
+void Validate(const AcceptanceParameters& parameters) {
+  const auto require = [](bool holds, const char* what) {
+    if (!holds) throw std::invalid_argument(std::string("back_end.acceptance.") + what);
+  };
+  require(parameters.support_distance_m > 0.0, "support_distance_m: must be positive");
+  require(parameters.neighbourhood_m >= parameters.support_distance_m, "neighbourhood_m: must be at least support_distance_m");
+  require(parameters.min_coverage >= 0.0 && parameters.min_coverage <= 1.0, "min_coverage: must be between 0 and 1");
+  require(parameters.max_sigma_m > 0.0, "max_sigma_m: must be positive");
+  require(parameters.max_sigma_rad > 0.0, "max_sigma_rad: must be positive");
+}
+
+}  // namespace incremental_segmatch
