@@ -62,6 +62,8 @@ class DynamicVoxelGrid::BlockMap {
  public:
   BlockMap() : entries_(1024) {}
 
+  /// Starts to fetch what Find will read.
+  void Prefetch(std::uint64_t key) const { __builtin_prefetch(&entries_[Home(key)]); }
   std::uint32_t Find(std::uint64_t key) const {
     for (std::size_t i = Home(key);; i = (i + 1) & (entries_.size() - 1)) {
       if (entries_[i].slot == kNoBlock) return kNoBlock;
@@ -176,21 +178,48 @@ DynamicVoxelGrid::DynamicVoxelGrid(DynamicVoxelGrid&&) noexcept = default;
 DynamicVoxelGrid& DynamicVoxelGrid::operator=(DynamicVoxelGrid&&) noexcept = default;
 
 VoxelUpdate DynamicVoxelGrid::Insert(const Points& points_sensor, const Pose& T_odom_sensor) {
+  // Blocks lie anywhere in memory. A chunk of points at a time, everything that a pass over the chunk needs was asked for by the
+  // pass before it, so that the fetches overlap instead of following each other.
+  constexpr std::size_t kChunk = 128;
   VoxelUpdate update;
+  std::array<Located, kChunk> located;
+  const Pose T_grid_sensor = T_odom_grid_.inverse() * T_odom_sensor;
+  touched_.clear();
+  for (std::size_t begin = 0; begin < points_sensor.size(); begin += kChunk) {
+    const std::size_t end = std::min(begin + kChunk, points_sensor.size());
+    const std::size_t count = Locate(points_sensor.data() + begin, end - begin, T_grid_sensor, located.data(), &update);
+    std::uint64_t last_key = ~std::uint64_t{0};
+    std::uint32_t slot = kNoBlock;
+    for (std::size_t i = 0; i < count; ++i) {
+      const std::uint64_t key = PackBlock(located[i].coordinates);
+      if (key != last_key) {
+        slot = block_map_->Find(key);
+        if (slot == kNoBlock) slot = AddBlock(located[i].coordinates);
+        last_key = key;
+      }
+      located[i].slot = slot;
+      __builtin_prefetch(&block(slot));
+      __builtin_prefetch(&block(slot).voxels[located[i].cell], 1);
+    }
+    for (std::size_t i = 0; i < count; ++i) AddPoint(located[i]);
+  }
+  CollectTouched(&update);
+  return update;
+}
+
+/// (3.3): finds block and cell of each point, drops those that have none, and returns how many are left.
+std::size_t DynamicVoxelGrid::Locate(const Eigen::Vector3f* points_sensor, std::size_t count, const Pose& T_grid_sensor,
+                                     Located* located, VoxelUpdate* update) const {
   const Eigen::Vector3d center(parameters_.center_m[0], parameters_.center_m[1], parameters_.center_m[2]);
   const double cells_per_m = 1.0 / parameters_.resolution_m;
-  const Pose T_grid_sensor = T_odom_grid_.inverse() * T_odom_sensor;
   const Eigen::Matrix3d R_cells = cells_per_m * T_grid_sensor.linear();
   const Eigen::Vector3d t_cells = cells_per_m * (T_grid_sensor.translation() - center);
   const std::array<double, 3> half_cells{std::ldexp(1.0, parameters_.bits[0] - 1), std::ldexp(1.0, parameters_.bits[1] - 1),
                                          std::ldexp(1.0, parameters_.bits[2] - 1)};
   const float resolution = static_cast<float>(parameters_.resolution_m);
-  const std::uint32_t min_points = static_cast<std::uint32_t>(parameters_.min_points_per_voxel);
-
-  touched_.clear();
-  std::array<std::int32_t, 3> last_coordinates{};
-  std::uint32_t last_slot = kNoBlock;
-  for (const Eigen::Vector3f& p : points_sensor) {
+  Located* out = located;
+  for (const Eigen::Vector3f* point = points_sensor; point != points_sensor + count; ++point) {
+    const Eigen::Vector3f& p = *point;
     std::array<double, 3> cells;
     for (int axis = 0; axis < 3; ++axis)
       cells[axis] = R_cells(axis, 0) * p[0] + R_cells(axis, 1) * p[1] + R_cells(axis, 2) * p[2] + t_cells[axis];
@@ -198,55 +227,65 @@ VoxelUpdate DynamicVoxelGrid::Insert(const Points& points_sensor, const Pose& T_
     const bool inside = cells[0] >= -half_cells[0] && cells[0] < half_cells[0] && cells[1] >= -half_cells[1] &&
                         cells[1] < half_cells[1] && cells[2] >= -half_cells[2] && cells[2] < half_cells[2];
     if (!inside) {
-      ++(p.allFinite() ? update.dropped_outside : update.dropped_nonfinite);
+      ++(p.allFinite() ? update->dropped_outside : update->dropped_nonfinite);
       continue;
     }
-    std::array<std::int32_t, 3> coordinates;
-    unsigned cell = 0;
-    Eigen::Vector3f in_block;
+    out->cell = 0;
     for (int axis = 0; axis < 3; ++axis) {
       std::int32_t index = static_cast<std::int32_t>(cells[axis]);
       index -= cells[axis] < index;  // floor
-      coordinates[axis] = index >> 2;
-      cell |= static_cast<unsigned>(index & 3) << (2 * axis);
-      in_block[axis] = static_cast<float>(cells[axis] - 4 * coordinates[axis]) * resolution;
+      out->coordinates[axis] = index >> 2;
+      out->cell |= static_cast<unsigned>(index & 3) << (2 * axis);
+      out->in_block[axis] = static_cast<float>(cells[axis] - 4 * out->coordinates[axis]) * resolution;
     }
-    if (last_slot == kNoBlock || coordinates != last_coordinates) {
-      last_slot = FindBlock(coordinates);
-      if (last_slot == kNoBlock) last_slot = AddBlock(coordinates);
-      last_coordinates = coordinates;
-    }
-    Block& home = block(last_slot);
-    Voxel& voxel = home.voxels[cell];
-    const std::uint64_t bit = std::uint64_t{1} << cell;
-    if (!(home.occupied & bit)) {
-      home.occupied |= bit;
-      voxel = {Eigen::Vector3f::Zero(), 0};
-      ++occupied_voxels_;
-    }
-    if (!(home.touched & bit)) {
-      home.touched |= bit;
-      touched_.push_back({last_slot * kCellsPerBlock + cell, (home.active & bit) != 0, voxel.centroid_block});
-    }
-    // (3.4) for m = 1; repeated, it gives the mean of all points.
-    ++voxel.count;
-    voxel.centroid_block += (in_block - voxel.centroid_block) * (1.f / static_cast<float>(voxel.count));
+    block_map_->Prefetch(PackBlock(out->coordinates));
+    ++out;
   }
+  return static_cast<std::size_t>(out - located);
+}
 
-  for (const Touched& touched : touched_) {
+void DynamicVoxelGrid::AddPoint(const Located& point) {
+  Block& home = block(point.slot);
+  Voxel& voxel = home.voxels[point.cell];
+  const std::uint64_t bit = std::uint64_t{1} << point.cell;
+  if (!(home.occupied & bit)) {
+    home.occupied |= bit;
+    voxel = {Eigen::Vector3f::Zero(), 0};
+    ++occupied_voxels_;
+  }
+  if (!(home.touched & bit)) {
+    home.touched |= bit;
+    touched_.push_back({point.slot * kCellsPerBlock + point.cell, (home.active & bit) != 0, voxel.centroid_block});
+  }
+  // (3.4) for m = 1; repeated, it gives the mean of all points.
+  ++voxel.count;
+  voxel.centroid_block += (point.in_block - voxel.centroid_block) * (1.f / static_cast<float>(voxel.count));
+}
+
+/// Reports what became of the voxels that got points.
+void DynamicVoxelGrid::CollectTouched(VoxelUpdate* update) {
+  constexpr std::size_t kAhead = 16;
+  const std::uint32_t min_points = static_cast<std::uint32_t>(parameters_.min_points_per_voxel);
+  update->moved.reserve(touched_.size());
+  for (std::size_t i = 0; i < touched_.size(); ++i) {
+    if (i + kAhead < touched_.size()) {
+      const VoxelHandle ahead = touched_[i + kAhead].voxel;
+      __builtin_prefetch(&block(ahead / kCellsPerBlock), 1);
+      __builtin_prefetch(&block(ahead / kCellsPerBlock).voxels[ahead % kCellsPerBlock]);
+    }
+    const Touched& touched = touched_[i];
     Block& home = block(touched.voxel / kCellsPerBlock);
     const unsigned cell = touched.voxel % kCellsPerBlock;
     const Voxel& voxel = home.voxels[cell];
     home.touched &= ~(std::uint64_t{1} << cell);
     if (touched.was_active) {
-      update.moved.push_back({touched.voxel, touched.before_block, voxel.centroid_block});
+      update->moved.push_back({touched.voxel, touched.before_block, voxel.centroid_block});
     } else if (voxel.count >= min_points) {
       home.active |= std::uint64_t{1} << cell;
-      update.activated.push_back(touched.voxel);
+      update->activated.push_back(touched.voxel);
     }
   }
-  active_voxels_ += update.activated.size();
-  return update;
+  active_voxels_ += update->activated.size();
 }
 
 VoxelUpdate DynamicVoxelGrid::RemoveOutside(const Eigen::Vector3d& center_odom, double radius_m) {
@@ -315,6 +354,10 @@ std::uint32_t DynamicVoxelGrid::AddBlock(const std::array<std::int32_t, 3>& coor
   }
   Block& added = block(slot);
   added.coordinates = coordinates;
+  for (int dz = -1; dz <= 1; ++dz)
+    for (int dy = -1; dy <= 1; ++dy)
+      for (int dx = -1; dx <= 1; ++dx)
+        block_map_->Prefetch(PackBlock({coordinates[0] + dx, coordinates[1] + dy, coordinates[2] + dz}));
   for (int dz = -1; dz <= 1; ++dz)
     for (int dy = -1; dy <= 1; ++dy)
       for (int dx = -1; dx <= 1; ++dx) {

@@ -155,6 +155,17 @@ class DynamicVoxelGrid {
 
   Block& block(std::uint32_t slot) { return pages_[slot / kBlocksPerPage][slot % kBlocksPerPage]; }
   const Block& block(std::uint32_t slot) const { return pages_[slot / kBlocksPerPage][slot % kBlocksPerPage]; }
+  /// A point on its way into its voxel.
+  struct Located {
+    Eigen::Vector3f in_block;
+    std::array<std::int32_t, 3> coordinates;  ///< of its block
+    std::uint32_t cell;
+    std::uint32_t slot;
+  };
+  std::size_t Locate(const Eigen::Vector3f* points_sensor, std::size_t count, const Pose& T_grid_sensor, Located* located,
+                     VoxelUpdate* update) const;
+  void AddPoint(const Located& point);
+  void CollectTouched(VoxelUpdate* update);
   std::uint32_t FindBlock(const std::array<std::int32_t, 3>& coordinates) const;
   std::uint32_t AddBlock(const std::array<std::int32_t, 3>& coordinates);
   void RemoveBlock(std::uint32_t slot);
