@@ -46,6 +46,8 @@ case "$system" in
     # Debian's own ROS 1, one package per interface and library.
     packages+=(
       catkin ros-message-generation ros-message-runtime
+      ros-diagnostic-msgs ros-geometry-msgs ros-nav-msgs ros-sensor-msgs ros-std-msgs ros-std-srvs ros-tf2-msgs
+      ros-visualization-msgs
       libdiagnostic-msgs-dev libdiagnostic-updater-dev libdynamic-reconfigure-config-init-mutex-dev libgeometry-msgs-dev
       libnav-msgs-dev libnodeletlib-dev libros-rosgraph-msgs-dev librosbag-dev libroscpp-dev librostest-dev
       libsensor-msgs-dev libstd-msgs-dev libstd-srvs-dev libtf2-dev libtf2-eigen-dev libtf2-msgs-dev libtf2-ros-dev
