@@ -103,7 +103,7 @@ JudgedClosure Judge(const Truth& truth, const ClosureRow& closure, const Scoring
   judged.target_step = *target;
   if (!(truth.seconds(*query) - truth.seconds(*target) > parameters.min_age_s &&
         truth.path_m(*query) - truth.path_m(*target) > parameters.min_path_m)) {
-    judged.verdict = Verdict::kTrivial;
+    judged.verdict = ClosureVerdict::kTrivial;
     return judged;
   }
   const Pose error = (truth.pose(*target).inverse() * truth.pose(*query)).inverse() * closure.T_target_query;
@@ -112,7 +112,7 @@ JudgedClosure Judge(const Truth& truth, const ClosureRow& closure, const Scoring
   judged.rotation_error_deg = std::acos(cosine) * kDegreesPerRadian;
   const bool is_true = judged.translation_error_m < parameters.max_translation_m &&
                        judged.rotation_error_deg < parameters.max_rotation_deg;
-  judged.verdict = is_true ? Verdict::kTrue : Verdict::kFalse;
+  judged.verdict = is_true ? ClosureVerdict::kTrue : ClosureVerdict::kFalse;
   return judged;
 }
 
@@ -140,10 +140,10 @@ Score ScoreClosures(const std::vector<StampNs>& stamps_ns, const std::vector<Pos
   for (const ClosureRow& closure : closures) {
     const JudgedClosure judged = Judge(truth, closure, parameters);
     score.judged.push_back(judged);
-    score.unmatched_closures += judged.verdict == Verdict::kUnmatched;
-    score.trivial_closures += judged.verdict == Verdict::kTrivial;
-    score.false_closures += judged.verdict == Verdict::kFalse;
-    if (judged.verdict != Verdict::kTrue) continue;
+    score.unmatched_closures += judged.verdict == ClosureVerdict::kUnmatched;
+    score.trivial_closures += judged.verdict == ClosureVerdict::kTrivial;
+    score.false_closures += judged.verdict == ClosureVerdict::kFalse;
+    if (judged.verdict != ClosureVerdict::kTrue) continue;
     ++score.true_closures;
     found[judged.query_step] = true;
     translation_errors.push_back(judged.translation_error_m);

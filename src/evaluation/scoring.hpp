@@ -35,7 +35,7 @@ struct ScoringParameters {
   double max_rotation_deg = 3.0;   ///< and nearer than this
 };
 
-enum class Verdict {
+enum class ClosureVerdict {
   kTrue,
   kFalse,
   kTrivial,    ///< the target is too young: earns nothing
@@ -44,7 +44,7 @@ enum class Verdict {
 
 /// A closure with its judgement.
 struct JudgedClosure {
-  Verdict verdict = Verdict::kUnmatched;
+  ClosureVerdict verdict = ClosureVerdict::kUnmatched;
   std::size_t query_step = 0;   ///< valid unless unmatched
   std::size_t target_step = 0;  ///< valid unless unmatched
   double translation_error_m = 0.0;
