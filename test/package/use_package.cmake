@@ -15,7 +15,7 @@ file(REMOVE_RECURSE ${BUILD})
 run(${CMAKE_COMMAND} -S ${SOURCE} -B ${BUILD} -DCMAKE_BUILD_TYPE=Debug -Dincremental_segmatch_DIR=${PACKAGE_DIR}
     -DPYTHON_EXECUTABLE=/usr/bin/python3 -DPython3_EXECUTABLE=/usr/bin/python3)
 run(${CMAKE_COMMAND} --build ${BUILD})
-run(${SEGMATCH} simulate --out ${BUILD}/drive --sensor vlp16 --max-scans 3)
+run(${SEGMATCH} simulate --out ${BUILD}/drive --sensor VLP-16 --max-scans 3)
 execute_process(COMMAND ${BUILD}/close_loops ${BUILD}/drive/sequences/00
   RESULT_VARIABLE result OUTPUT_VARIABLE output)
 if(NOT result EQUAL 0 OR NOT output MATCHES "scan 2: [1-9][0-9]* segments")
