@@ -22,8 +22,10 @@ namespace {
 using Matrix6 = Eigen::Matrix<double, 6, 6>;
 using Vector6 = Eigen::Matrix<double, 6, 1>;
 
-constexpr double kOutlierSigmas = 3.0;    // mean deviation per axis from which a closure counts as outvoted
-constexpr double kAnnealingFactor = 5.0;  // between the widths of two solver runs of a graduated optimization
+constexpr double kOutlierSigmas = 3.0;     // mean deviation per axis from which a closure counts as outvoted
+constexpr double kCoarseTolerance = 1e-2;  // relative change of cost at which an intermediate solver run ends
+constexpr double kFinalTolerance = 1e-6;   // and at which the final one ends
+constexpr double kAnnealingFactor = 5.0;   // between the widths of two solver runs of a graduated optimization
 
 // Translation and unit quaternion (Eigen's order x, y, z, w) as Ceres's parameter blocks.
 struct Variables {
@@ -165,7 +167,6 @@ class PoseGraph::Impl {
     const RobotIndex map_target = robots_.at(robot_target).map;
     const RobotIndex map_query = robots_.at(robot_query).map;
     if (map_target != map_query) JoinMaps(closures_.back());
-    has_new_closures_ = true;
     return true;
   }
 
@@ -179,22 +180,21 @@ class PoseGraph::Impl {
     std::transform(nodes_.begin(), nodes_.end(), variables.begin(),
                    [](const PoseGraphNode& node) { return Variables(node.T_map_sensor); });
     const std::vector<Variables> start = variables;
-    const bool disagree = has_new_closures_ && WorstDeviation(start) > kOutlierSigmas;
+    const bool news_disagree = WorstDeviation(start, optimized_closures_) > kOutlierSigmas;
 
-    ceres::Solver::Summary summary = Solve(parameters_.robust_width, variables);
+    ceres::Solver::Summary summary = Solve(parameters_.robust_width, kFinalTolerance, variables);
     report.initial_cost = summary.initial_cost;
     report.iterations = static_cast<int>(summary.iterations.size());
-    if (disagree) {
+    if (news_disagree) {
       // A robust loss that starts far from a closure can't tell a false one from one that corrects much drift. So begin
       // wide enough to believe all, narrow down, and keep whichever of the two ends costs less.
       std::vector<Variables> graduated = start;
-      ceres::Solver::Summary last;
-      for (double width = WorstDeviation(start) * std::sqrt(6.0);; width /= kAnnealingFactor) {
-        width = std::max(width, parameters_.robust_width);
-        last = Solve(width, graduated);
-        report.iterations += static_cast<int>(last.iterations.size());
-        if (width <= parameters_.robust_width) break;
+      for (double width = WorstDeviation(start, 0) * std::sqrt(6.0); width > parameters_.robust_width;
+           width /= kAnnealingFactor) {
+        report.iterations += static_cast<int>(Solve(width, kCoarseTolerance, graduated).iterations.size());
       }
+      const ceres::Solver::Summary last = Solve(parameters_.robust_width, kFinalTolerance, graduated);
+      report.iterations += static_cast<int>(last.iterations.size());
       if (last.final_cost < summary.final_cost) {
         summary = last;
         variables = graduated;
@@ -207,7 +207,7 @@ class PoseGraph::Impl {
       const PoseGraphNode& newest = nodes_[entry.second.nodes.back()];
       entry.second.T_map_odom = newest.T_map_sensor * newest.T_odom_sensor.inverse();
     }
-    has_new_closures_ = false;
+    optimized_closures_ = closures_.size();
     report.outvoted_closures = std::count_if(closures_.begin(), closures_.end(), [this](const PoseGraphEdge& closure) {
       return Deviation(nodes_[closure.from].T_map_sensor, nodes_[closure.to].T_map_sensor, closure) > kOutlierSigmas;
     });
@@ -356,16 +356,18 @@ class PoseGraph::Impl {
     if (best) MoveRobot(robots_.at(robot), *best);
   }
 
-  double WorstDeviation(const std::vector<Variables>& variables) const {
+  // Over the closures from `first` on.
+  double WorstDeviation(const std::vector<Variables>& variables, std::size_t first) const {
     double worst = 0.0;
-    for (const PoseGraphEdge& closure : closures_) {
+    for (std::size_t i = first; i < closures_.size(); ++i) {
+      const PoseGraphEdge& closure = closures_[i];
       worst = std::max(worst, Deviation(variables[closure.from].ToPose(), variables[closure.to].ToPose(), closure));
     }
     return worst;
   }
 
   // Optimizes `variables` in place with a Cauchy loss of this width on the closures.
-  ceres::Solver::Summary Solve(double width, std::vector<Variables>& variables) const {
+  ceres::Solver::Summary Solve(double width, double tolerance, std::vector<Variables>& variables) const {
     ceres::Problem problem;
     for (Variables& node : variables) {
       problem.AddParameterBlock(node.t.data(), 3);
@@ -387,7 +389,7 @@ class PoseGraph::Impl {
     ceres::Solver::Options options;
     options.linear_solver_type = ceres::SPARSE_NORMAL_CHOLESKY;
     options.max_num_iterations = parameters_.max_iterations;
-    options.function_tolerance = 1e-6;
+    options.function_tolerance = tolerance;
     options.num_threads = 1;
     options.logging_type = ceres::SILENT;
     ceres::Solver::Summary summary;
@@ -405,7 +407,7 @@ class PoseGraph::Impl {
   std::vector<PoseGraphNode> nodes_;
   std::vector<PoseGraphEdge> odometry_;
   std::vector<PoseGraphEdge> closures_;
-  bool has_new_closures_ = false;
+  std::size_t optimized_closures_ = 0;  // the first so many have been through an optimization
 };
 
 PoseGraph::PoseGraph(const PoseGraphParameters& parameters) : impl_(std::make_unique<Impl>(parameters)) {}
