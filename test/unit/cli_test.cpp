@@ -20,13 +20,13 @@ namespace {
 #define EXPECT_HAS(text, word) \
   EXPECT_NE((text).find(word), std::string::npos) << "`" << (word) << "` is not in: " << (text)
 
-struct Run {
+struct Outcome {
   int status = -1;
   std::string output;  // of both streams
 };
 
-Run Segmatch(const std::string& arguments) {
-  Run run;
+Outcome Segmatch(const std::string& arguments) {
+  Outcome run;
   FILE* pipe = popen((std::string(SEGMATCH_PROGRAM) + " " + arguments + " 2>&1").c_str(), "r");
   if (pipe == nullptr) return run;
   char buffer[4096];
@@ -44,11 +44,11 @@ std::vector<std::string> Lines(const std::string& path) {
 }
 
 TEST(Program, HelpTeachesWithExamples) {
-  const Run run = Segmatch("--help");
+  const Outcome run = Segmatch("--help");
   EXPECT_EQ(run.status, 0);
   for (const std::string command : {"simulate", "kitti2bag", "evaluate"}) {
     EXPECT_HAS(run.output, command);
-    const Run help = Segmatch(command + " --help");
+    const Outcome help = Segmatch(command + " --help");
     EXPECT_EQ(help.status, 0);
     EXPECT_HAS(help.output, "  segmatch " + command + " --");
   }
@@ -58,13 +58,13 @@ TEST(Program, HelpTeachesWithExamples) {
 TEST(Program, WrongCallsAreRefused) {
   EXPECT_NE(Segmatch("").status, 0);
   EXPECT_NE(Segmatch("dance").status, 0);
-  const Run nothing = Segmatch("evaluate --out x");
+  const Outcome nothing = Segmatch("evaluate --out x");
   EXPECT_NE(nothing.status, 0);
   EXPECT_HAS(nothing.output, "--kitti");
-  const Run no_sequence = Segmatch("evaluate --kitti x --out x");
+  const Outcome no_sequence = Segmatch("evaluate --kitti x --out x");
   EXPECT_NE(no_sequence.status, 0);
   EXPECT_HAS(no_sequence.output, "--sequence");
-  const Run both = Segmatch("evaluate --kitti x --sequence 00 --bag y --out x");
+  const Outcome both = Segmatch("evaluate --kitti x --sequence 00 --bag y --out x");
   EXPECT_NE(both.status, 0);
 }
 
@@ -78,20 +78,21 @@ class Drive : public testing::Test {
 };
 
 TEST_F(Drive, MissingDataIsNamed) {
-  const Run run = Segmatch("evaluate --kitti /nonexistent --sequence 00 --out " + Out("result"));
+  const Outcome run = Segmatch("evaluate --kitti /nonexistent --sequence 00 --out " + Out("result"));
   EXPECT_EQ(run.status, 1);
   EXPECT_HAS(run.output, "segmatch: /nonexistent/sequences/00/velodyne is no folder");
 }
 
 TEST_F(Drive, UnknownParameterIsNamed) {
   const std::string config = directory_.Write("config.yaml", "front_end:\n  no_such_key: 1\n");
-  const Run run = Segmatch("evaluate " + Kitti() + " --config " + config + " --out " + Out("result"));
+  const Outcome run = Segmatch("evaluate " + Kitti() + " --config " + config + " --out " + Out("result"));
   EXPECT_EQ(run.status, 1);
   EXPECT_HAS(run.output, "front_end.no_such_key");
 }
 
 TEST_F(Drive, EvaluateWritesItsFiles) {
-  const Run run = Segmatch("evaluate " + Kitti() + " --odometry odometry.txt --max-steps 5 --out " + Out("a/result"));
+  const Outcome run =
+      Segmatch("evaluate " + Kitti() + " --odometry odometry.txt --max-steps 5 --out " + Out("a/result"));
   ASSERT_EQ(run.status, 0) << run.output;
   EXPECT_HAS(run.output, "5 steps");
   EXPECT_HAS(run.output, "trajectory error");
@@ -126,7 +127,7 @@ TEST_F(Drive, EvaluateWritesItsFiles) {
 }
 
 TEST_F(Drive, TheOdometryUsedIsSaid) {
-  const Run run = Segmatch("evaluate " + Kitti() + " --out " + Out("result"));
+  const Outcome run = Segmatch("evaluate " + Kitti() + " --out " + Out("result"));
   ASSERT_EQ(run.status, 0) << run.output;
   EXPECT_HAS(run.output, "does not drift");
   std::ifstream file(Out("result/summary.json"));
@@ -134,13 +135,13 @@ TEST_F(Drive, TheOdometryUsedIsSaid) {
 }
 
 TEST_F(Drive, Bags) {
-  const Run written = Segmatch("kitti2bag " + Kitti() + " --out " + Out("drive.bag"));
+  const Outcome written = Segmatch("kitti2bag " + Kitti() + " --out " + Out("drive.bag"));
 #ifdef SEGMATCH_WITH_ROSBAG
   ASSERT_EQ(written.status, 0) << written.output;
   EXPECT_HAS(written.output, "odometry.txt");
-  const Run from_bag = Segmatch("evaluate --bag " + Out("drive.bag") + " --out " + Out("bag"));
+  const Outcome from_bag = Segmatch("evaluate --bag " + Out("drive.bag") + " --out " + Out("bag"));
   ASSERT_EQ(from_bag.status, 0) << from_bag.output;
-  const Run from_files = Segmatch("evaluate " + Kitti() + " --odometry odometry.txt --out " + Out("files"));
+  const Outcome from_files = Segmatch("evaluate " + Kitti() + " --odometry odometry.txt --out " + Out("files"));
   ASSERT_EQ(from_files.status, 0) << from_files.output;
   std::ifstream bag(Out("bag/summary.json")), files(Out("files/summary.json"));
   const nlohmann::json a = nlohmann::json::parse(bag), b = nlohmann::json::parse(files);
@@ -152,14 +153,14 @@ TEST_F(Drive, Bags) {
 #else
   EXPECT_EQ(written.status, 1);
   EXPECT_HAS(written.output, "not built in");
-  const Run run = Segmatch("evaluate --bag x.bag --out " + Out("result"));
+  const Outcome run = Segmatch("evaluate --bag x.bag --out " + Out("result"));
   EXPECT_EQ(run.status, 1);
   EXPECT_HAS(run.output, "--bag is not built in");
 #endif
 }
 
 TEST_F(Drive, SimulatedOnTheFly) {
-  const Run run = Segmatch("evaluate --simulate --sensor VLP-16 --route lap --max-steps 8 --out " + Out("result"));
+  const Outcome run = Segmatch("evaluate --simulate --sensor VLP-16 --route lap --max-steps 8 --out " + Out("result"));
   ASSERT_EQ(run.status, 0) << run.output;
   EXPECT_HAS(run.output, "8 steps of simulated drive along route lap");
 }
