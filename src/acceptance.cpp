@@ -22,6 +22,7 @@ Verdict Judge(const Evidence& evidence, const AcceptanceParameters& parameters) 
   if (evidence.inliers < evidence.runner_up + parameters.min_margin) return Verdict::kAmbiguous;
   if (evidence.Coverage() < parameters.min_coverage) return Verdict::kUncovered;
   if (evidence.sigma_m > parameters.max_sigma_m || evidence.sigma_rad > parameters.max_sigma_rad) return Verdict::kUncertain;
+  if (evidence.distance_m > parameters.max_distance_m) return Verdict::kTooFar;
   return Verdict::kAccepted;
 }
 
@@ -32,6 +33,7 @@ void Validate(const AcceptanceParameters& parameters) {
   require(parameters.support_distance_m > 0.0, "support_distance_m: must be positive");
   require(parameters.neighbourhood_m >= parameters.support_distance_m, "neighbourhood_m: must be at least support_distance_m");
   require(parameters.min_coverage >= 0.0 && parameters.min_coverage <= 1.0, "min_coverage: must be between 0 and 1");
+  require(parameters.max_distance_m > 0.0, "max_distance_m: must be positive");
   require(parameters.max_sigma_m > 0.0, "max_sigma_m: must be positive");
   require(parameters.max_sigma_rad > 0.0, "max_sigma_rad: must be positive");
 }

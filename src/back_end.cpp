@@ -22,6 +22,17 @@ StepEnd ToStepEnd(RecognitionOutcome outcome) {
   return StepEnd::kTooFewCandidates;
 }
 
+StepEnd ToStepEnd(Verdict verdict) {
+  switch (verdict) {
+    case Verdict::kAccepted: return StepEnd::kRecognized;
+    case Verdict::kAmbiguous: return StepEnd::kAmbiguous;
+    case Verdict::kUncovered: return StepEnd::kUncovered;
+    case Verdict::kUncertain: return StepEnd::kUncertain;
+    case Verdict::kTooFar: return StepEnd::kTooFar;
+  }
+  return StepEnd::kUncertain;
+}
+
 /// The part of a covariance of T_map_odom, perturbed on the left, that matters to the query sensor's pose in the target
 /// sensor's frame, perturbed on the right: T_target_query exp(xi) with xi = Ad(T_map_query^-1) xi_map.
 Covariance6 CovarianceAtQuery(const Covariance6& covariance_map, const Pose& T_map_query) {
@@ -55,9 +66,11 @@ const char* ToString(StepEnd end) {
     case StepEnd::kTilted: return "tilted";
     case StepEnd::kLargeResidual: return "large_residual";
     case StepEnd::kNotRefined: return "not_refined";
+    case StepEnd::kTooYoung: return "too_young";
     case StepEnd::kAmbiguous: return "ambiguous";
     case StepEnd::kUncovered: return "uncovered";
     case StepEnd::kUncertain: return "uncertain";
+    case StepEnd::kTooFar: return "too_far";
   }
   return "unknown";
 }
@@ -111,16 +124,8 @@ BackEndStep BackEnd::Process(const SegmentDelta& delta) {
 
   step.counts.end = ToStepEnd(result.outcome);
   if (result.recognition) {
-    Recognition recognition = *result.recognition;
-    Evidence evidence;
-    step.counts.end = RefineAndJudge(robot, &recognition, &evidence);
-    step.counts.evidence = evidence;
-    if (step.counts.end == StepEnd::kRecognized) step.closure = MakeClosure(robot, delta.stamp_ns, recognition);
-    if (step.closure) {
-      step.closure->candidates = result.candidates;
-      step.closure->evidence = evidence;
-      AcceptRecognition(robot, recognition);
-    }
+    step.closure = Verify(robot, delta.stamp_ns, result, &step.counts);
+    if (step.closure) AcceptClosure(robot, *step.closure);
   }
   timer.Lap("refinement");
 
@@ -351,29 +356,38 @@ const SegmentView& BackEnd::MatchedView(RobotIndex robot, const Correspondence& 
   throw std::logic_error("an inlier is none of the candidates");
 }
 
-/// Refines the transform on points, gathers the evidence and judges it.
-StepEnd BackEnd::RefineAndJudge(RobotIndex robot, Recognition* recognition, Evidence* evidence) const {
-  evidence->inliers = recognition->inliers.size();
-  evidence->runner_up = recognition->runner_up_size;
+/// Refines a recognition on points, gathers the evidence for it and judges that. `counts` gets the evidence and the end.
+std::optional<LoopClosure> BackEnd::Verify(RobotIndex robot, StampNs stamp_ns, const RecognizerResult& result,
+                                           BackEndCounts* counts) const {
+  Recognition recognition = *result.recognition;
+  Evidence evidence;
+  evidence.inliers = recognition.inliers.size();
+  evidence.runner_up = recognition.runner_up_size;
   if (parameters_.refinement.enabled) {
-    const std::optional<RefinedTransform> refined = Refine(robot, *recognition);
-    if (!refined) return StepEnd::kNotRefined;
-    recognition->T_target_local = refined->T_target_local;
-    recognition->covariance = refined->covariance;
-    evidence->overlap = refined->overlap;
+    const std::optional<RefinedTransform> refined = Refine(robot, recognition);
+    if (!refined) {
+      counts->end = StepEnd::kNotRefined;
+      return std::nullopt;
+    }
+    recognition.T_target_local = refined->T_target_local;
+    recognition.covariance = refined->covariance;
+    evidence.overlap = refined->overlap;
   }
-  MeasureCoverage(robot, recognition->T_target_local, evidence);
-  const Covariance6 covariance =
-      CovarianceAtQuery(recognition->covariance, recognition->T_target_local * robots_[robot].T_odom_sensor);
-  evidence->sigma_m = LargestSigma(covariance.topLeftCorner<3, 3>());
-  evidence->sigma_rad = LargestSigma(covariance.bottomRightCorner<3, 3>());
-  switch (Judge(*evidence, parameters_.acceptance)) {
-    case Verdict::kAccepted: return StepEnd::kRecognized;
-    case Verdict::kAmbiguous: return StepEnd::kAmbiguous;
-    case Verdict::kUncovered: return StepEnd::kUncovered;
-    case Verdict::kUncertain: return StepEnd::kUncertain;
+  std::optional<LoopClosure> closure = MakeClosure(robot, stamp_ns, recognition);
+  if (!closure) {
+    counts->end = StepEnd::kTooYoung;
+    return std::nullopt;
   }
-  return StepEnd::kRecognized;
+  MeasureCoverage(robot, recognition.T_target_local, &evidence);
+  evidence.distance_m = closure->T_target_query.translation().norm();
+  evidence.sigma_m = LargestSigma(closure->covariance.topLeftCorner<3, 3>());
+  evidence.sigma_rad = LargestSigma(closure->covariance.bottomRightCorner<3, 3>());
+  counts->evidence = evidence;
+  counts->end = ToStepEnd(Judge(evidence, parameters_.acceptance));
+  if (counts->end != StepEnd::kRecognized) return std::nullopt;
+  closure->candidates = result.candidates;
+  closure->evidence = evidence;
+  return closure;
 }
 
 /// Holds all local segments, not the inliers alone, against the map around the recognised place.
@@ -446,11 +460,12 @@ std::optional<LoopClosure> BackEnd::MakeClosure(RobotIndex robot, StampNs stamp_
   return closure;
 }
 
-void BackEnd::AcceptRecognition(RobotIndex robot, const Recognition& recognition) {
+/// What was recognised is the same: remembered until the local segment's tracking ends.
+void BackEnd::AcceptClosure(RobotIndex robot, const LoopClosure& closure) {
   if (!IsLoopClosure()) return;
-  for (const Correspondence& inlier : recognition.inliers) robots_[robot].local.at(inlier.local.id).same_as = inlier.target;
-  const RobotIndex target_robot = recognition.inliers.front().target.robot;
-  if (robots_[robot].frame != robots_[target_robot].frame) JoinFrames(robot, target_robot, recognition.T_target_local);
+  for (const SegmentMatch& match : closure.matches) robots_[robot].local.at(match.local.id).same_as = match.target;
+  const RobotIndex target_robot = closure.matches.front().target.robot;
+  if (robots_[robot].frame != robots_[target_robot].frame) JoinFrames(robot, target_robot, closure.T_map_odom);
 }
 
 /// The first closure between robots of different frames aligns their maps: every robot of the query's frame moves.

@@ -15,6 +15,7 @@ struct AcceptanceParameters {
   double neighbourhood_m = 10.0;        ///< and is expected to be, where any target segment is this near: the map was seen there
   double min_coverage = 0.25;           ///< least share of the expected local segments that are supported
   std::size_t min_margin = 1;           ///< inliers must outnumber the best clique beside them by so many
+  double max_distance_m = 20.0;         ///< of the query from the pose its target was seen from: odometry drifts in between
   double max_sigma_m = 0.5;             ///< largest standard deviation of the query's position, along its worst axis
   double max_sigma_rad = 0.02;          ///< the same of its orientation
 };
@@ -29,6 +30,8 @@ struct Evidence {
   double sigma_m = 0.0;        ///< standard deviation of the query's position, along its worst axis
   double sigma_rad = 0.0;      ///< and of its orientation
 
+  double distance_m = 0.0;     ///< between the two sensor poses of the closure
+
   double Coverage() const { return expected == 0 ? 0.0 : static_cast<double>(supported) / static_cast<double>(expected); }
 };
 
@@ -36,7 +39,7 @@ struct Evidence {
 void MeasureCoverage(const std::vector<Eigen::Vector3d>& centroids_local, const std::vector<Eigen::Vector3d>& centroids_target,
                      const AcceptanceParameters& parameters, Evidence* evidence);
 
-enum class Verdict { kAccepted, kAmbiguous, kUncovered, kUncertain };
+enum class Verdict { kAccepted, kAmbiguous, kUncovered, kUncertain, kTooFar };
 
 Verdict Judge(const Evidence& evidence, const AcceptanceParameters& parameters);
 

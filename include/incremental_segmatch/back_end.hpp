@@ -67,7 +67,7 @@ struct LoopClosure {
 
 /// The stage that ended a step: why no loop here?
 enum class StepEnd { kRecognized, kNoSegments, kNoTargets, kTooFewCandidates, kCliqueTooSmall, kDegenerate, kTilted, kLargeResidual,
-                     kNotRefined, kAmbiguous, kUncovered, kUncertain };
+                     kNotRefined, kTooYoung, kAmbiguous, kUncovered, kUncertain, kTooFar };
 const char* ToString(StepEnd end);
 
 /// The map side's part of the funnel.
@@ -80,7 +80,7 @@ struct BackEndCounts {
   std::size_t tested_pairs = 0;
   std::size_t edges = 0;
   std::size_t clique = 0;
-  std::optional<Evidence> evidence;     ///< of the recognition, accepted or not
+  std::optional<Evidence> evidence;     ///< of a recognition that was judged, accepted or not
   StepEnd end = StepEnd::kNoSegments;
 };
 
@@ -153,11 +153,12 @@ class BackEnd {
   std::map<RobotIndex, Correspondences> CollectCorrespondences(RobotIndex robot) const;
   RecognizerResult Recognize(RobotIndex robot, const std::map<RobotIndex, Correspondences>& by_frame);
   const SegmentView& MatchedView(RobotIndex robot, const Correspondence& inlier) const;
-  StepEnd RefineAndJudge(RobotIndex robot, Recognition* recognition, Evidence* evidence) const;
+  std::optional<LoopClosure> Verify(RobotIndex robot, StampNs stamp_ns, const RecognizerResult& result,
+                                    BackEndCounts* counts) const;
   std::optional<RefinedTransform> Refine(RobotIndex robot, const Recognition& recognition) const;
   void MeasureCoverage(RobotIndex robot, const Pose& T_map_odom, Evidence* evidence) const;
   std::optional<LoopClosure> MakeClosure(RobotIndex robot, StampNs stamp_ns, const Recognition& recognition) const;
-  void AcceptRecognition(RobotIndex robot, const Recognition& recognition);
+  void AcceptClosure(RobotIndex robot, const LoopClosure& closure);
   void JoinFrames(RobotIndex robot, RobotIndex target_robot, const Pose& T_map_odom);
 
   BackEndParameters parameters_;
