@@ -1,0 +1,432 @@
+#include "incremental_segmatch/point_refinement.hpp"
+
+#include <Eigen/Eigenvalues>
+#include <Eigen/Geometry>
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstdint>
+#include <limits>
+#include <stdexcept>
+#include <string>
+
+namespace incremental_segmatch {
+namespace {
+
+using Matrix6 = Eigen::Matrix<double, 6, 6>;
+using Vector6 = Eigen::Matrix<double, 6, 1>;
+
+constexpr float kThin = 0.2f;            // variance across over variance along, below which a neighbourhood counts as thin
+constexpr std::size_t kMinNeighbours = 8;  // that tell a surface's direction
+constexpr double kPointWeight = 0.02;    // of a distance to a point: it has the cloud's spacing for an error
+constexpr std::size_t kMinPairs = 30;
+constexpr std::size_t kMaxCoarsePoints = 1000;
+constexpr double kShrink = 0.85;         // of the robust weight's width, from iteration to iteration
+constexpr double kFineWidth = 1.0 / 3.0;  // of the robust weight in the last iteration, over the distance to a partner
+constexpr double kConvergedM = 5e-4;     // motion of the points in the last iteration
+constexpr double kMaxExtentM = 1e5;      // floats are exact enough to a centimetre up to here
+constexpr std::uint32_t kNone = 0xffffffffu;
+
+Eigen::Matrix3d Cross(const Eigen::Vector3d& v) {
+  Eigen::Matrix3d m;
+  m << 0, -v.z(), v.y(), v.z(), 0, -v.x(), -v.y(), v.x(), 0;
+  return m;
+}
+
+/// d(xi at origin) / d(xi at center): what a perturbation about a center is about the origin.
+Matrix6 Shift(const Eigen::Vector3d& center) {
+  Matrix6 adjoint = Matrix6::Identity();
+  adjoint.topRightCorner<3, 3>() = Cross(center);
+  return adjoint;
+}
+
+/// Points by cubic cells: contiguous per cell, the cells in an open hash table. Finds what is within a cell's side.
+class CellHash {
+ public:
+  CellHash(const std::vector<Eigen::Vector3f>& points, float side) : side_(side), per_metre_(1.f / side) {
+    std::size_t slots = 16;
+    while (slots < 2 * points.size()) slots *= 2;
+    table_.resize(slots);
+    std::vector<std::uint32_t> slot_of(points.size());
+    for (std::size_t i = 0; i < points.size(); ++i) {
+      slot_of[i] = FindOrAdd(KeyOf(points[i]));
+      ++table_[slot_of[i]].count;
+    }
+    std::uint32_t begin = 0;
+    for (const std::uint32_t slot : used_) {
+      table_[slot].begin = begin;
+      begin += table_[slot].count;
+      table_[slot].count = 0;
+    }
+    points_.resize(points.size());
+    for (std::size_t i = 0; i < points.size(); ++i) {
+      Cell& cell = table_[slot_of[i]];
+      points_[cell.begin + cell.count++] = points[i];
+    }
+  }
+
+  const std::vector<Eigen::Vector3f>& points() const { return points_; }
+  float side() const { return side_; }
+
+  /// Mean of each cell's points.
+  std::vector<Eigen::Vector3f> CellMeans() const {
+    std::vector<Eigen::Vector3f> means;
+    means.reserve(used_.size());
+    for (const std::uint32_t slot : used_) {
+      Eigen::Vector3f sum = Eigen::Vector3f::Zero();
+      for (std::uint32_t i = 0; i < table_[slot].count; ++i) sum += points_[table_[slot].begin + i] - points_[table_[slot].begin];
+      means.push_back(points_[table_[slot].begin] + sum / static_cast<float>(table_[slot].count));
+    }
+    return means;
+  }
+
+  /// Index of the nearest point within a distance of at most side(), kNone if there is none.
+  std::uint32_t Nearest(const Eigen::Vector3f& p, float distance) const {
+    std::uint32_t nearest = kNone;
+    float best = distance * distance;
+    VisitCells(p, &best, [&](const Cell& cell) {
+      for (std::uint32_t i = cell.begin; i < cell.begin + cell.count; ++i) {
+        const float distance2 = (points_[i] - p).squaredNorm();
+        if (distance2 > best) continue;
+        best = distance2;
+        nearest = i;
+      }
+    });
+    return nearest;
+  }
+
+  /// Calls visit(point) for each point within a radius of at most side().
+  template <class Visit>
+  void ForEachWithin(const Eigen::Vector3f& p, float radius, Visit&& visit) const {
+    const float radius2 = radius * radius;
+    float bound = radius2;
+    VisitCells(p, &bound, [&](const Cell& cell) {
+      for (std::uint32_t i = cell.begin; i < cell.begin + cell.count; ++i)
+        if ((points_[i] - p).squaredNorm() <= radius2) visit(points_[i]);
+    });
+  }
+
+ private:
+  struct Cell {
+    std::uint64_t key = 0;
+    std::uint32_t begin = 0;
+    std::uint32_t count = 0;  ///< 0: a free slot
+  };
+  static constexpr std::uint64_t kBias = std::uint64_t{1} << 20;
+
+  static std::uint64_t Pack(std::int64_t x, std::int64_t y, std::int64_t z) {
+    return (static_cast<std::uint64_t>(x) + kBias) << 42 | ((static_cast<std::uint64_t>(y) + kBias) & 0x1fffff) << 21 |
+           ((static_cast<std::uint64_t>(z) + kBias) & 0x1fffff);
+  }
+  Eigen::Vector3f CellOf(const Eigen::Vector3f& p) const { return (p * per_metre_).array().floor(); }
+  std::uint64_t KeyOf(const Eigen::Vector3f& p) const {
+    const Eigen::Vector3f cell = CellOf(p);
+    return Pack(static_cast<std::int64_t>(cell.x()), static_cast<std::int64_t>(cell.y()), static_cast<std::int64_t>(cell.z()));
+  }
+  std::uint32_t SlotOf(std::uint64_t key) const {
+    return static_cast<std::uint32_t>((key * 0x9e3779b97f4a7c15u) >> 32) & static_cast<std::uint32_t>(table_.size() - 1);
+  }
+  std::uint32_t FindOrAdd(std::uint64_t key) {
+    std::uint32_t slot = SlotOf(key);
+    while (table_[slot].count != 0 && table_[slot].key != key) slot = (slot + 1) & (table_.size() - 1);
+    if (table_[slot].count == 0) {
+      table_[slot].key = key;
+      used_.push_back(slot);
+    }
+    return slot;
+  }
+  const Cell* Find(std::uint64_t key) const {
+    for (std::uint32_t slot = SlotOf(key); table_[slot].count != 0; slot = (slot + 1) & (table_.size() - 1))
+      if (table_[slot].key == key) return &table_[slot];
+    return nullptr;
+  }
+
+  /// Calls visit(cell) for p's cell and its neighbours, skipping those that are farther than the (shrinking) squared bound.
+  template <class Visit>
+  void VisitCells(const Eigen::Vector3f& p, const float* bound2, Visit&& visit) const {
+    const Eigen::Vector3f home = CellOf(p);
+    const Eigen::Vector3f below = p - home * side_;
+    const Eigen::Vector3f above = Eigen::Vector3f::Constant(side_) - below;
+    const auto gap = [&](int axis, int step) { return step == 0 ? 0.f : std::max(0.f, step < 0 ? below[axis] : above[axis]); };
+    static constexpr std::array<int, 3> kSteps{0, -1, 1};  // home first: its points tighten the bound
+    for (const int dx : kSteps) {
+      const float x2 = gap(0, dx) * gap(0, dx);
+      if (x2 > *bound2) continue;
+      for (const int dy : kSteps) {
+        const float xy2 = x2 + gap(1, dy) * gap(1, dy);
+        if (xy2 > *bound2) continue;
+        for (const int dz : kSteps) {
+          if (xy2 + gap(2, dz) * gap(2, dz) > *bound2) continue;
+          const Cell* cell = Find(Pack(static_cast<std::int64_t>(home.x()) + dx, static_cast<std::int64_t>(home.y()) + dy,
+                                       static_cast<std::int64_t>(home.z()) + dz));
+          if (cell != nullptr) visit(*cell);
+        }
+      }
+    }
+  }
+
+  float side_;
+  float per_metre_;
+  std::vector<Eigen::Vector3f> points_;
+  std::vector<Cell> table_;
+  std::vector<std::uint32_t> used_;
+};
+
+/// In which directions a target point holds a local point, as the metric of its residual.
+struct Surface {
+  bool known = false;
+  bool is_thin = false;
+  Eigen::Matrix3f metric = Eigen::Matrix3f::Zero();
+};
+
+Surface EstimateSurface(const CellHash& cloud, const Eigen::Vector3f& p, float radius) {
+  std::size_t count = 0;
+  Eigen::Vector3f sum = Eigen::Vector3f::Zero();
+  Eigen::Matrix3f outer = Eigen::Matrix3f::Zero();
+  cloud.ForEachWithin(p, radius, [&](const Eigen::Vector3f& q) {
+    const Eigen::Vector3f d = q - p;
+    ++count;
+    sum += d;
+    outer.noalias() += d * d.transpose();
+  });
+  Surface surface;
+  surface.known = true;
+  surface.metric = static_cast<float>(kPointWeight) * Eigen::Matrix3f::Identity();
+  if (count < kMinNeighbours) return surface;
+  const float n = static_cast<float>(count);
+  Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d> solver;
+  solver.computeDirect((outer / n - sum * sum.transpose() / (n * n)).cast<double>());
+  const Eigen::Vector3f variance = solver.eigenvalues().cast<float>();
+  if (!(variance[0] < kThin * variance[2])) return surface;
+  surface.is_thin = true;
+  surface.metric.setZero();
+  // A pole is thin in two directions alike; the rim of a wall, where the neighbourhood is cut off, only seems to be.
+  const bool is_pole = variance[1] < kThin * variance[2] && variance[0] > kThin * variance[1];
+  for (int axis = 0; axis < (is_pole ? 2 : 1); ++axis) {
+    const Eigen::Vector3f across = solver.eigenvectors().col(axis).cast<float>();
+    surface.metric += across * across.transpose();
+  }
+  return surface;
+}
+
+/// The target at one spacing, with surfaces that are estimated when they are first asked for.
+class Target {
+ public:
+  Target(const std::vector<Eigen::Vector3f>& points, float side)
+      : cells_(points, side), surfaces_(points.size()) {}
+
+  const CellHash& cells() const { return cells_; }
+  const Surface& SurfaceAt(std::uint32_t point, const CellHash& cloud, float radius) {
+    Surface& surface = surfaces_[point];
+    if (!surface.known) surface = EstimateSurface(cloud, cells_.points()[point], radius);
+    return surface;
+  }
+
+ private:
+  CellHash cells_;
+  std::vector<Surface> surfaces_;
+};
+
+/// Normal equations of one iteration, perturbation on the left about the clouds' common origin.
+struct System {
+  Matrix6 information = Matrix6::Zero();
+  Vector6 gradient = Vector6::Zero();
+  std::size_t pairs = 0;
+  double squares = 0.0;          ///< robustly weighted sum of squared residuals
+  double weights = 0.0;
+  double thin_squares = 0.0;     ///< of the pairs across something thin, unweighted
+  std::size_t thin_pairs = 0;
+  Eigen::Vector3d sum = Eigen::Vector3d::Zero();
+  double sum_squared_norms = 0.0;
+
+  Eigen::Vector3d Center() const { return sum / static_cast<double>(pairs); }
+  /// Root mean square distance of the points from their center: what a rotation is multiplied by to be a length.
+  double Extent() const {
+    return std::sqrt(std::max(1e-6, sum_squared_norms / static_cast<double>(pairs) - Center().squaredNorm()));
+  }
+};
+
+System BuildSystem(const std::vector<Eigen::Vector3f>& local, const Pose& T_target_local, Target* target,
+                   const CellHash& cloud, float radius, float distance, double width_m) {
+  const Eigen::Matrix3f R = T_target_local.linear().cast<float>();
+  const Eigen::Vector3f t = T_target_local.translation().cast<float>();
+  const double width2 = width_m * width_m;
+  System system;
+  for (const Eigen::Vector3f& point : local) {
+    const Eigen::Vector3f p = R * point + t;
+    const std::uint32_t nearest = target->cells().Nearest(p, distance);
+    if (nearest == kNone) continue;
+    const Surface& surface = target->SurfaceAt(nearest, cloud, radius);
+    const Eigen::Vector3d difference = (p - target->cells().points()[nearest]).cast<double>();
+    const Eigen::Matrix3d metric = surface.metric.cast<double>();
+    const Eigen::Vector3d force = metric * difference;
+    const double square = difference.dot(force);
+    const double weight = std::pow(width2 / (width2 + square), 2);  // Geman and McClure
+    const Eigen::Vector3d at = p.cast<double>();
+    const Eigen::Matrix3d cross = Cross(at);
+    const Eigen::Matrix3d metric_cross = metric * cross;
+    system.information.topLeftCorner<3, 3>() += weight * metric;
+    system.information.topRightCorner<3, 3>() -= weight * metric_cross;
+    system.information.bottomRightCorner<3, 3>() -= weight * (cross * metric_cross);
+    system.gradient.head<3>() += weight * force;
+    system.gradient.tail<3>() += weight * at.cross(force);
+    system.squares += weight * square;
+    system.weights += weight;
+    if (surface.is_thin) {
+      system.thin_squares += square;
+      ++system.thin_pairs;
+    }
+    system.sum += at;
+    system.sum_squared_norms += at.squaredNorm();
+    ++system.pairs;
+  }
+  system.information.bottomLeftCorner<3, 3>() = system.information.topRightCorner<3, 3>().transpose();
+  return system;
+}
+
+/// The system about the points' center with rotations as lengths, in its eigenbasis: stiff directions and open ones.
+struct Directions {
+  Matrix6 basis;            ///< columns: perturbations about the clouds' common origin, each moving the points by some 1 m
+  Vector6 stiffness;        ///< ascending
+  int open = 0;             ///< the first so many directions are open
+
+  Directions(const System& system, double min_stiffness) {
+    Matrix6 scaled = Shift(system.Center());
+    scaled.rightCols<3>() /= system.Extent();
+    const Eigen::SelfAdjointEigenSolver<Matrix6> solver(scaled.transpose() * system.information * scaled);
+    basis = scaled * solver.eigenvectors();
+    stiffness = solver.eigenvalues();
+    while (open < 6 && !(stiffness[open] > min_stiffness * stiffness[5])) ++open;
+  }
+
+  /// Gauss-Newton step over the stiff directions; its length in metres at the points.
+  std::pair<Vector6, double> Step(const Vector6& gradient) const {
+    Vector6 along = -(basis.transpose() * gradient);
+    for (int i = 0; i < 6; ++i) along[i] = i < open ? 0.0 : along[i] / stiffness[i];
+    return {basis * along, along.norm()};
+  }
+};
+
+Pose Perturb(const Vector6& xi, const Pose& T) {
+  Pose delta = Pose::Identity();
+  const double angle = xi.tail<3>().norm();
+  if (angle > 0.0) delta.linear() = Eigen::AngleAxisd(angle, xi.tail<3>() / angle).toRotationMatrix();
+  delta.translation() = xi.head<3>();
+  return delta * T;
+}
+
+/// Points relative to a center, without those that are not finite or absurdly far away.
+std::vector<Eigen::Vector3f> Center(const std::vector<Eigen::Vector3d>& points, const Eigen::Vector3d& center) {
+  std::vector<Eigen::Vector3f> centered;
+  centered.reserve(points.size());
+  for (const Eigen::Vector3d& p : points) {
+    const Eigen::Vector3d relative = p - center;
+    if (relative.cwiseAbs().maxCoeff() < kMaxExtentM && relative.allFinite()) centered.push_back(relative.cast<float>());
+  }
+  return centered;
+}
+
+Eigen::Vector3d Mean(const std::vector<Eigen::Vector3d>& points) {
+  Eigen::Vector3d sum = Eigen::Vector3d::Zero();
+  std::size_t count = 0;
+  for (const Eigen::Vector3d& p : points) {
+    if (!p.allFinite()) continue;
+    sum += p;
+    ++count;
+  }
+  return count == 0 ? sum : Eigen::Vector3d(sum / static_cast<double>(count));
+}
+
+/// At most `count` points, spread evenly over the list.
+std::vector<Eigen::Vector3f> Thin(const std::vector<Eigen::Vector3f>& points, std::size_t count) {
+  if (points.size() <= count) return points;
+  std::vector<Eigen::Vector3f> thinned;
+  thinned.reserve(count);
+  for (std::size_t i = 0; i < count; ++i) thinned.push_back(points[i * points.size() / count]);
+  return thinned;
+}
+
+/// Share of the pairs that tell something of their own: neighbours share the errors of the surface that they are held to.
+double IndependentShare(const std::vector<Eigen::Vector3f>& local, float side) {
+  return static_cast<double>(CellHash(local, side).CellMeans().size()) / static_cast<double>(local.size());
+}
+
+void Refuse(const char* name, double value, const char* remedy) {
+  throw std::invalid_argument(std::string("refinement.") + name + " is " + std::to_string(value) + "; it must be " + remedy);
+}
+
+}  // namespace
+
+void Validate(const RefinementParameters& parameters) {
+  const auto is_length = [](double value) { return value > 0.0 && std::isfinite(value); };
+  if (!is_length(parameters.min_distance_m)) Refuse("min_distance_m", parameters.min_distance_m, "positive and finite");
+  if (!(parameters.max_distance_m >= parameters.min_distance_m) || !is_length(parameters.max_distance_m))
+    Refuse("max_distance_m", parameters.max_distance_m, "finite and at least min_distance_m");
+  if (parameters.max_iterations < 1) Refuse("max_iterations", parameters.max_iterations, "at least 1");
+  if (!(parameters.min_overlap >= 0.0 && parameters.min_overlap <= 1.0))
+    Refuse("min_overlap", parameters.min_overlap, "between 0 and 1");
+  if (!is_length(parameters.normal_radius_m)) Refuse("normal_radius_m", parameters.normal_radius_m, "positive and finite");
+  if (parameters.max_points < kMinPairs)
+    Refuse("max_points", static_cast<double>(parameters.max_points), "at least 30");
+  if (!(parameters.min_stiffness > 0.0 && parameters.min_stiffness < 1.0))
+    Refuse("min_stiffness", parameters.min_stiffness, "between 0 and 1");
+  if (parameters.max_open_directions < 0 || parameters.max_open_directions > 5)
+    Refuse("max_open_directions", parameters.max_open_directions, "between 0 and 5");
+}
+
+std::optional<RefinedTransform> RefineOnPoints(const std::vector<Eigen::Vector3d>& points_local,
+                                               const std::vector<Eigen::Vector3d>& points_target,
+                                               const Pose& T_target_local, const RefinementParameters& parameters) {
+  Validate(parameters);
+  // Both clouds are taken relative to their own centers: floats and normal equations are good at small numbers.
+  const Eigen::Vector3d center_target = Mean(points_target);
+  const Eigen::Vector3d center_local = Mean(points_local);
+  const std::vector<Eigen::Vector3f> local = Thin(Center(points_local, center_local), parameters.max_points);
+  const std::vector<Eigen::Vector3f> cloud = Center(points_target, center_target);
+  if (local.size() < kMinPairs || cloud.size() < kMinPairs) return std::nullopt;
+  const std::vector<Eigen::Vector3f> coarse_local = Thin(local, kMaxCoarsePoints);
+  const float radius = static_cast<float>(parameters.normal_radius_m);
+  const float min_distance = static_cast<float>(parameters.min_distance_m);
+
+  Target fine(cloud, std::max(radius, min_distance));
+  Target coarse(CellHash(cloud, min_distance).CellMeans(), static_cast<float>(parameters.max_distance_m));
+  Pose T = Eigen::Translation3d(-center_target) * T_target_local * Eigen::Translation3d(center_local);
+
+  // Wide as long as far points are far from their true partners; the distance to a partner follows down to its minimum.
+  const double last_width_m = kFineWidth * parameters.min_distance_m;
+  double width_m = parameters.max_distance_m;
+  for (int iteration = 0; iteration < parameters.max_iterations; ++iteration) {
+    const bool is_last = width_m == last_width_m;
+    const bool is_fine = width_m <= parameters.min_distance_m;
+    const double distance_m = std::max(width_m, parameters.min_distance_m);
+    const System system = BuildSystem(is_last ? local : coarse_local, T, is_fine ? &fine : &coarse, fine.cells(), radius,
+                                      static_cast<float>(distance_m), width_m);
+    if (system.pairs < kMinPairs) return std::nullopt;
+    const auto [step, length_m] = Directions(system, parameters.min_stiffness).Step(system.gradient);
+    T = Perturb(step, T);
+    if (is_last && length_m < kConvergedM) break;
+    width_m = std::max(last_width_m, kShrink * width_m);
+  }
+
+  const System system = BuildSystem(local, T, &fine, fine.cells(), radius, min_distance, last_width_m);
+  RefinedTransform refined;
+  refined.overlap = static_cast<double>(system.pairs) / static_cast<double>(local.size());
+  if (system.pairs < kMinPairs || refined.overlap < parameters.min_overlap) return std::nullopt;
+  const Directions directions(system, parameters.min_stiffness);
+  refined.open_directions = directions.open;
+  if (directions.open > parameters.max_open_directions) return std::nullopt;
+  refined.rms_m = std::sqrt(system.thin_squares / static_cast<double>(std::max<std::size_t>(1, system.thin_pairs)));
+
+  const double variance = system.squares / system.weights / IndependentShare(local, min_distance);
+  Vector6 variances;
+  for (int i = 0; i < 6; ++i)
+    variances[i] = i < directions.open ? std::pow(parameters.max_distance_m / 2.0, 2) : variance / directions.stiffness[i];
+  const Matrix6 to_target_origin = Shift(center_target) * directions.basis;
+  refined.covariance = to_target_origin * variances.asDiagonal() * to_target_origin.transpose();
+  refined.T_target_local = Eigen::Translation3d(center_target) * T * Eigen::Translation3d(-center_local);
+  // Products of many rotations drift from being one.
+  refined.T_target_local.linear() = Eigen::Quaterniond(refined.T_target_local.linear()).normalized().toRotationMatrix();
+  return refined;
+}
+
+}  // namespace incremental_segmatch
