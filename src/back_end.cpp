@@ -22,6 +22,18 @@ StepEnd ToStepEnd(RecognitionOutcome outcome) {
   return StepEnd::kTooFewCandidates;
 }
 
+/// The points within the radius of the center, or within the first multiple by two of it that holds enough of them.
+std::vector<Eigen::Vector3d> NearPoints(std::vector<Eigen::Vector3d> points, const Eigen::Vector3d& center,
+                                        const NearPointsParameters& parameters) {
+  for (double radius_m = parameters.radius_m;; radius_m *= 2.0) {
+    const auto is_near = [&](const Eigen::Vector3d& p) { return (p - center).squaredNorm() <= radius_m * radius_m; };
+    const std::size_t near = static_cast<std::size_t>(std::count_if(points.begin(), points.end(), is_near));
+    if (near < std::min(parameters.min_points, points.size())) continue;
+    points.erase(std::stable_partition(points.begin(), points.end(), is_near), points.end());
+    return points;
+  }
+}
+
 StepEnd ToStepEnd(Verdict verdict) {
   switch (verdict) {
     case Verdict::kAccepted: return StepEnd::kRecognized;
@@ -92,6 +104,7 @@ BackEnd::BackEnd(const BackEndParameters& parameters, TargetMap map) : parameter
     throw std::invalid_argument("back_end.matching.requery_distance: must not be negative");
   Validate(parameters.refinement);
   Validate(parameters.acceptance);
+  if (!(parameters.near_points.radius_m > 0.0)) throw std::invalid_argument("back_end.near_points.radius_m: must be positive");
   Recognizer{parameters.recognizer};  // refuses what it does not accept now, not at the first recognition
   for (RobotIndex robot = 0; robot < map_.robots(); ++robot) {
     robots_.emplace_back();
@@ -421,7 +434,8 @@ std::optional<RefinedTransform> BackEnd::Refine(RobotIndex robot, const Recognit
     for (const Eigen::Vector3f& p : *view.points_centroid)
       points_target.push_back(centroid_map + R_map_odom * p.cast<double>());
   }
-  return RefineOnPoints(points_local, points_target, recognition.T_target_local, parameters_.refinement);
+  return RefineOnPoints(NearPoints(std::move(points_local), robots_[robot].T_odom_sensor.translation(), parameters_.near_points),
+                        points_target, recognition.T_target_local, parameters_.refinement);
 }
 
 /// The closure to the nearest of the poses that the matched views were seen from. None if all of them are too young.
