@@ -311,7 +311,7 @@ void Partition::SortIntoRows(const std::vector<Match>& matches) {
       column_of[i] = static_cast<std::uint64_t>(Cell(offset.x()));
       row_of[i] = RowKey(Cell(offset.y()), layout_ == Layout::kCubes ? Cell(offset.z()) : 0);
     }
-    order_ = SortedByKey(SortedByKey(std::move(order_), column_of), row_of);
+    order_ = SortedByKeys(std::move(order_), row_of, column_of);
   }
   matches_.reserve(matches.size());
   for (const std::uint32_t i : order_) matches_.push_back(matches[i]);
@@ -504,13 +504,16 @@ void Cache::Follow(const Correspondences& correspondences) {
   std::vector<std::uint64_t> local_keys, target_keys;
   std::vector<std::uint32_t> order;
   matches.reserve(correspondences.size());
+  local_keys.reserve(correspondences.size());
+  target_keys.reserve(correspondences.size());
+  order.reserve(correspondences.size());
   for (const Correspondence& c : correspondences) {
     matches.push_back(MakeMatch(c));
     local_keys.push_back(matches.back().local_key);
     target_keys.push_back(matches.back().target_key);
     if (IsUsable(matches.back())) order.push_back(static_cast<std::uint32_t>(matches.size() - 1));
   }
-  order = SortedByKey(SortedByKey(std::move(order), target_keys), local_keys);
+  order = SortedByKeys(std::move(order), local_keys, target_keys);
 
   std::vector<std::uint32_t> last = std::move(sorted_);
   sorted_.clear();

@@ -2,8 +2,10 @@
 /// Stable sort of indices by integer keys, private to the core.
 #pragma once
 
+#include <algorithm>
 #include <array>
 #include <cstdint>
+#include <tuple>
 #include <utility>
 #include <vector>
 
@@ -36,6 +38,17 @@ inline std::vector<std::uint32_t> SortedByKey(std::vector<std::uint32_t> order,
   }
   for (std::size_t i = 0; i < order.size(); ++i) order[i] = entries[i].index;
   return order;
+}
+
+/// Sorts `order` by the first key, then by the second, stably. O(n) compares where it is sorted already.
+inline std::vector<std::uint32_t> SortedByKeys(std::vector<std::uint32_t> order,
+                                               const std::vector<std::uint64_t>& first_keys,
+                                               const std::vector<std::uint64_t>& second_keys) {
+  const auto less = [&](std::uint32_t a, std::uint32_t b) {
+    return std::tie(first_keys[a], second_keys[a]) < std::tie(first_keys[b], second_keys[b]);
+  };
+  if (std::is_sorted(order.begin(), order.end(), less)) return order;
+  return SortedByKey(SortedByKey(std::move(order), second_keys), first_keys);
 }
 
 }  // namespace incremental_segmatch

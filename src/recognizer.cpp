@@ -42,7 +42,7 @@ Correspondences SortedCanonically(const Correspondences& correspondences) {
     local_keys.push_back(Packed(correspondences[i].local));
     target_keys.push_back(Packed(correspondences[i].target));
   }
-  order = SortedByKey(SortedByKey(std::move(order), target_keys), local_keys);
+  order = SortedByKeys(std::move(order), local_keys, target_keys);
   Correspondences sorted;
   sorted.reserve(order.size());
   for (const std::uint32_t i : order) sorted.push_back(correspondences[i]);

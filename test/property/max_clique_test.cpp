@@ -110,6 +110,35 @@ TEST(MaxClique, EqualsExhaustiveSearchAndTakesTheSmallestList) {
   }
 }
 
+/// Size of the largest clique among the candidates that beats `best`, by counting alone: slow, but without colours.
+std::size_t LargestSize(const ConsistencyGraph& graph, const Vertices& candidates, std::size_t size, std::size_t best) {
+  best = std::max(best, size);
+  for (std::size_t i = 0; i < candidates.size() && size + candidates.size() - i > best; ++i) {
+    Vertices next;
+    for (std::size_t j = i + 1; j < candidates.size(); ++j) {
+      if (graph.HasEdge(candidates[i], candidates[j])) next.push_back(candidates[j]);
+    }
+    best = LargestSize(graph, next, size + 1, best);
+  }
+  return best;
+}
+
+TEST(MaxClique, ColouringNeverCutsOffTheMaximum) {
+  for (unsigned seed = 0; seed < 150; ++seed) {
+    SCOPED_TRACE("seed " + std::to_string(seed));
+    std::mt19937 random(seed);
+    const double density = 0.6 + 0.1 * (random() % 3);
+    const std::size_t n = density > 0.75 ? 40 : 60;
+    const ConsistencyGraph graph = ConsistencyGraph::FromEdges(n, RandomEdges(n, density, random));
+    Vertices all(n);
+    std::iota(all.begin(), all.end(), 0);
+    const MaxCliqueResult result = FindMaxClique(graph, Parameters(3));
+    EXPECT_TRUE(result.proven_maximum);
+    EXPECT_TRUE(IsClique(graph, result.vertices));
+    EXPECT_EQ(result.vertices.size(), LargestSize(graph, all, 0, 0));
+  }
+}
+
 TEST(MaxClique, IsIndependentOfTheLabels) {
   for (unsigned seed = 0; seed < 200; ++seed) {
     SCOPED_TRACE("seed " + std::to_string(seed));
@@ -146,6 +175,30 @@ TEST(MaxClique, FindsPlantedCliques) {
     const MaxCliqueResult result = FindMaxClique(ConsistencyGraph::FromEdges(n, edges), Parameters(6));
     EXPECT_TRUE(result.proven_maximum);
     EXPECT_EQ(result.vertices, members);
+  }
+}
+
+// Graphs where the bound is tight, with the sizes that plain colouring, without recolouring, finds: a bound that is one
+// too low loses the largest clique of one of them.
+TEST(MaxClique, KnownSizesOfDenseGraphs) {
+  const std::vector<std::pair<unsigned, std::size_t>> sizes{{140u, 26u}, {141u, 19u}, {142u, 25u}, {143u, 20u},
+                                                            {144u, 26u}, {145u, 21u}, {146u, 25u}, {147u, 20u},
+                                                            {148u, 26u}, {149u, 20u}};
+  for (const auto& [seed, size] : sizes) {
+    SCOPED_TRACE("seed " + std::to_string(seed));
+    std::mt19937 random(seed);
+    const std::size_t n = 110;
+    const unsigned percent = seed % 2 == 0 ? 85 : 80;
+    Edges edges;
+    for (std::uint32_t a = 0; a < n; ++a) {
+      for (std::uint32_t b = a + 1; b < n; ++b) {
+        if (random() % 100 < percent) edges.emplace_back(a, b);
+      }
+    }
+    const MaxCliqueResult result =
+        FindMaxClique(ConsistencyGraph::FromEdges(n, edges), Parameters(3, std::chrono::seconds(10)));
+    EXPECT_TRUE(result.proven_maximum);
+    EXPECT_EQ(result.vertices.size(), size);
   }
 }
 
