@@ -41,8 +41,9 @@ SegmentUpdate IncrementalSegmenter<Policy>::Remove(const std::vector<RemovedVoxe
     } else if (cluster.live_voxels == 0) {
       MarkDirty(&cluster);
     }
-    BlockNode& block = blocks_[gone.voxel / DynamicVoxelGrid::kCellsPerBlock];
-    if (--block.clustered == 0) SetBlockLabel(&block, kNoLabel);
+    BlockNode& block = BlockOf(gone.voxel);
+    block.clustered &= ~CellBit(gone.voxel);
+    if (block.clustered == 0) SetBlockLabel(&block, kNoLabel);
     Release(node.label);
     node = VoxelNode();
   }
@@ -55,21 +56,33 @@ SegmentUpdate IncrementalSegmenter<Policy>::Insert(const VoxelUpdate& update) {
     voxels_.resize(grid_->handle_capacity());
     blocks_.resize(voxels_.size() / DynamicVoxelGrid::kCellsPerBlock);
   }
-  for (const MovedVoxel& moved : update.moved) {
-    if (!IsClustered(moved.voxel)) continue;
-    Cluster& cluster = ClusterAt(FindRoot(voxels_[moved.voxel].label));
-    const Eigen::Vector3d corner = grid_->BlockCorner(moved.voxel);
-    cluster.moments.Move(corner + moved.before_block.cast<double>(), corner + moved.after_block.cast<double>());
-    cluster.grew = true;
-    MarkDirty(&cluster);
-  }
-  for (const VoxelHandle voxel : update.activated)
-    blocks_[voxel / DynamicVoxelGrid::kCellsPerBlock].pending |= std::uint64_t{1} << (voxel % DynamicVoxelGrid::kCellsPerBlock);
+  FollowCentroids(update.moved);
+  for (const VoxelHandle voxel : update.activated) BlockOf(voxel).pending |= CellBit(voxel);
   seeds_ = update.activated;
   policy_.PrepareSeeds(&seeds_);
   for (const VoxelHandle seed : seeds_)
     if (!IsClustered(seed)) GrowFromSeed(seed);
   return Settle();
+}
+
+/// Moved centroids are deltas of their clusters' moments. They come block by block, and most blocks are of one cluster.
+template <class Policy>
+void IncrementalSegmenter<Policy>::FollowCentroids(const std::vector<MovedVoxel>& moved_voxels) {
+  const BlockNode* block = nullptr;
+  Eigen::Vector3d corner = Eigen::Vector3d::Zero();
+  Label root = kNoLabel;
+  for (const MovedVoxel& moved : moved_voxels) {
+    if (block != &BlockOf(moved.voxel)) {
+      block = &BlockOf(moved.voxel);
+      corner = grid_->BlockCorner(moved.voxel);
+      root = block->label < kMixed ? FindRoot(block->label) : kNoLabel;
+    }
+    if ((block->clustered & CellBit(moved.voxel)) == 0) continue;
+    Cluster& cluster = ClusterAt(root != kNoLabel ? root : FindRoot(voxels_[moved.voxel].label));
+    cluster.moments.Move(corner + moved.before_block.cast<double>(), corner + moved.after_block.cast<double>());
+    cluster.grew = true;
+    MarkDirty(&cluster);
+  }
 }
 
 /// Algorithm 1: the region of new voxels that is reached from the seed joins, and links, the clusters that it meets.
@@ -95,8 +108,7 @@ void IncrementalSegmenter<Policy>::GrowFromSeed(VoxelHandle seed) {
 template <class Policy>
 void IncrementalSegmenter<Policy>::Queue(VoxelHandle voxel) {
   voxels_[voxel].label = kQueued;
-  blocks_[voxel / DynamicVoxelGrid::kCellsPerBlock].pending &=
-      ~(std::uint64_t{1} << (voxel % DynamicVoxelGrid::kCellsPerBlock));
+  BlockOf(voxel).pending &= ~CellBit(voxel);
   queue_.push_back(voxel);
 }
 
@@ -126,25 +138,30 @@ typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::Visit
 template <class Policy>
 typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::VisitNeighbourBlocks(VoxelHandle from, Label root) {
   const float radius2 = static_cast<float>(stencil_.radius_m() * stencil_.radius_m());
-  grid_->ForEachNeighbourBlock(stencil_, from, [&](std::uint32_t slot, std::uint64_t cells, const Eigen::Vector3f& shift) {
+  const float block_size_m = static_cast<float>(DynamicVoxelGrid::kBlockSide * grid_->parameters().resolution_m);
+  const Eigen::Vector3f center = grid_->CentroidInBlock(from);
+  grid_->ForEachStencilBlock(stencil_, from, [&](std::uint32_t slot, const NeighbourStencil::BlockVisit& at) {
     BlockNode& block = blocks_[slot];
-    const VoxelHandle first = slot * DynamicVoxelGrid::kCellsPerBlock;
-    const auto handle = [&](std::uint64_t bits) { return first + static_cast<VoxelHandle>(__builtin_ctzll(bits)); };
-    const auto is_near = [&](VoxelHandle to) { return (grid_->CentroidInBlock(to) + shift).squaredNorm() <= radius2; };
-    for (std::uint64_t pending = cells & block.pending; pending != 0; pending &= pending - 1) {
-      cells &= ~(pending & -pending);
-      if (is_near(handle(pending))) Queue(handle(pending));
-    }
-    if (block.label == kNoLabel) return true;
-    if (block.label != kMixed) {
+    std::uint64_t pending = block.pending & at.cells;
+    std::uint64_t clustered = block.clustered & at.cells;
+    if (clustered != 0 && block.label != kMixed) {
       SetBlockLabel(&block, FindRoot(block.label));
-      if (block.label == root) return true;
+      if (block.label == root) clustered = 0;
     }
-    for (; cells != 0; cells &= cells - 1) {
-      const VoxelHandle to = handle(cells);
-      const Label label = voxels_[to].label;
-      if (label == root || label == kQueued || !is_near(to)) continue;
-      root = Meet(root, label);
+    if ((pending | clustered) == 0) return true;
+
+    const Eigen::Vector3f shift(at.offset[0] * block_size_m - center.x(), at.offset[1] * block_size_m - center.y(),
+                                at.offset[2] * block_size_m - center.z());
+    const auto is_near = [&](VoxelHandle to) { return (grid_->CentroidInBlock(to) + shift).squaredNorm() <= radius2; };
+    const auto first_of = [&](std::uint64_t cells) {
+      return slot * DynamicVoxelGrid::kCellsPerBlock + static_cast<VoxelHandle>(__builtin_ctzll(cells));
+    };
+    for (; pending != 0; pending &= pending - 1)
+      if (is_near(first_of(pending))) Queue(first_of(pending));
+    for (; clustered != 0; clustered &= clustered - 1) {
+      const VoxelHandle to = first_of(clustered);
+      if (voxels_[to].label == root || !is_near(to)) continue;
+      root = Meet(root, voxels_[to].label);
       if (block.label != kMixed) break;
     }
     return true;
@@ -214,12 +231,13 @@ void IncrementalSegmenter<Policy>::AddVoxel(Label root, VoxelHandle voxel) {
   VoxelNode& node = voxels_[voxel];
   node.label = root;
   ++nodes_[root].references;
-  BlockNode& block = blocks_[voxel / DynamicVoxelGrid::kCellsPerBlock];
-  if (block.clustered++ == 0) {
+  BlockNode& block = BlockOf(voxel);
+  if (block.clustered == 0) {
     SetBlockLabel(&block, root);
   } else if (block.label != kMixed && FindRoot(block.label) != root) {
     SetBlockLabel(&block, kMixed);
   }
+  block.clustered |= CellBit(voxel);
   if (cluster.first == kEnd) {
     node.previous = node.next = voxel;
   } else {

@@ -133,6 +133,12 @@ class DynamicVoxelGrid {
   template <class Visit>
   void ForEachNeighbourBlock(const NeighbourStencil& stencil, VoxelHandle voxel, Visit&& visit) const;
 
+  /// The blocks themselves, for consumers that keep voxels of their own by handle: calls visit(slot, block_visit) for each block
+  /// that the stencil around the voxel reaches; visit returns false to stop. Of a voxel that the last call removed, it still
+  /// finds all blocks that stayed.
+  template <class Visit>
+  void ForEachStencilBlock(const NeighbourStencil& stencil, VoxelHandle voxel, Visit&& visit) const;
+
  private:
   static constexpr std::uint32_t kNoBlock = 0xffffffffu;
   struct Voxel {
@@ -191,22 +197,27 @@ class DynamicVoxelGrid {
 };
 
 template <class Visit>
-void DynamicVoxelGrid::ForEachNeighbourBlock(const NeighbourStencil& stencil, VoxelHandle voxel, Visit&& visit) const {
+void DynamicVoxelGrid::ForEachStencilBlock(const NeighbourStencil& stencil, VoxelHandle voxel, Visit&& visit) const {
   const Block& home = block(voxel / kCellsPerBlock);
-  const unsigned cell = voxel % kCellsPerBlock;
-  const Eigen::Vector3f center = home.voxels[cell].centroid_block;
-  for (const NeighbourStencil::BlockVisit& at : stencil.visits(cell)) {
+  for (const NeighbourStencil::BlockVisit& at : stencil.visits(voxel % kCellsPerBlock)) {
     const std::uint32_t slot =
         at.link >= 0 ? home.links[at.link]
                      : FindBlock({home.coordinates[0] + at.offset[0], home.coordinates[1] + at.offset[1],
                                   home.coordinates[2] + at.offset[2]});
-    if (slot == kNoBlock) continue;
+    if (slot != kNoBlock && !visit(slot, at)) return;
+  }
+}
+
+template <class Visit>
+void DynamicVoxelGrid::ForEachNeighbourBlock(const NeighbourStencil& stencil, VoxelHandle voxel, Visit&& visit) const {
+  const Eigen::Vector3f center = CentroidInBlock(voxel);
+  ForEachStencilBlock(stencil, voxel, [&](std::uint32_t slot, const NeighbourStencil::BlockVisit& at) {
     const std::uint64_t cells = block(slot).active & at.cells;
-    if (cells == 0) continue;
+    if (cells == 0) return true;
     const Eigen::Vector3f shift(at.offset[0] * block_size_m_ - center.x(), at.offset[1] * block_size_m_ - center.y(),
                                 at.offset[2] * block_size_m_ - center.z());
-    if (!visit(slot, cells, shift)) return;
-  }
+    return visit(slot, cells, shift);
+  });
 }
 
 template <class Visit>

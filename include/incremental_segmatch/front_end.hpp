@@ -18,7 +18,7 @@ namespace incremental_segmatch {
 
 /// When a tracked segment's state is worth a view.
 struct ViewParameters {
-  double growth_factor = 1.2;   ///< a new view once the segment has grown by this factor since its last view
+  double growth_factor = 1.4;   ///< a new view once the segment has grown by this factor since its last view
   double baseline_m = 10.0;     ///< or once it changed and the sensor is this far from where its last view was taken
 };
 

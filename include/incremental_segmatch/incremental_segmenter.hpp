@@ -122,9 +122,9 @@ class IncrementalSegmenter {
   };
   // What is known of a block of the grid, so that its voxels need not be looked at one by one.
   struct BlockNode {
-    std::uint64_t pending = 0;  // cells that are active and not clustered or queued yet
-    Label label = kNoLabel;     // of the one cluster that all its clustered voxels belong to; or kMixed
-    std::uint32_t clustered = 0;
+    std::uint64_t pending = 0;    // cells that are active and neither clustered nor queued yet
+    std::uint64_t clustered = 0;  // cells that are clustered
+    Label label = kNoLabel;       // of the one cluster that all its clustered voxels belong to; or kMixed
   };
   struct VoxelNode {
     Label label = kNoLabel;
@@ -138,11 +138,14 @@ class IncrementalSegmenter {
   Eigen::Vector3d PointOf(VoxelHandle voxel, const Eigen::Vector3f& in_block) const {
     return grid_->BlockCorner(voxel) + in_block.cast<double>();
   }
+  static std::uint64_t CellBit(VoxelHandle voxel) { return std::uint64_t{1} << (voxel % DynamicVoxelGrid::kCellsPerBlock); }
+  BlockNode& BlockOf(VoxelHandle voxel) { return blocks_[voxel / DynamicVoxelGrid::kCellsPerBlock]; }
   Label FindRoot(Label label) const;
   void Release(Label label) const;
   Cluster& ClusterAt(Label root) { return clusters_[nodes_[root].cluster]; }
   Label NewCluster();
   void GrowFromSeed(VoxelHandle seed);
+  void FollowCentroids(const std::vector<MovedVoxel>& moved);
   void Queue(VoxelHandle voxel);
   Label Meet(Label root, Label other);
   void SetBlockLabel(BlockNode* block, Label label);
