@@ -44,27 +44,27 @@ class BadInput : public testing::Test {
     ASSERT_TRUE(WaitFor([this] { return log_.getNumPublishers() > 0 && diagnostics_.getNumPublishers() > 0; }));
   }
 
-  /// Loads a front end of the given name, with its topics below that name. Returns false if it can't be loaded.
-  bool Load(const std::string& name, const std::string& type = "incremental_segmatch/FrontEndNodelet") {
+  /// Loads a nodelet of the given name, with its topics below a prefix. Returns false if it can't be loaded.
+  static bool LoadNodelet(const std::string& name, const std::string& type, const std::string& prefix) {
     nodelet::NodeletLoad load;
     load.request.name = "/" + name;
-    load.request.type = type;
+    load.request.type = "incremental_segmatch/" + type;
     for (const std::string topic : {"points", "odometry", "segments", "local_cloud", "front_end_steps", "loop_closures",
-                                    "trajectory", "save_map", "load_map"}) {
+                                    "trajectory", "save_map", "load_map", "back_end_steps"}) {
       load.request.remap_source_args.push_back("/" + topic);
-      load.request.remap_target_args.push_back("/" + name + "/" + topic);
+      load.request.remap_target_args.push_back("/" + prefix + "/" + topic);
     }
-    if (!ros::service::waitForService("/manager/load_nodelet", 10000)) return false;
-    if (!ros::service::call("/manager/load_nodelet", load) || !load.response.success) return false;
+    return ros::service::waitForService("/manager/load_nodelet", 10000) &&
+           ros::service::call("/manager/load_nodelet", load) && load.response.success;
+  }
+
+  /// Loads a front end and connects with it.
+  bool LoadAndConnect(const std::string& name) {
+    if (!LoadNodelet(name, "FrontEndNodelet", name)) return false;
     clouds_ = nh_.advertise<sensor_msgs::PointCloud2>("/" + name + "/points", 10);
     segments_ = nh_.subscribe<SegmentArray>("/" + name + "/segments", 10,
                                             [this](const SegmentArrayConstPtr& m) { received_.push_back(*m); });
-    return true;
-  }
-
-  bool LoadAndConnect(const std::string& name) {
-    return Load(name) &&
-           WaitFor([this] { return clouds_.getNumSubscribers() > 0 && segments_.getNumPublishers() > 0; });
+    return WaitFor([this] { return clouds_.getNumSubscribers() > 0 && segments_.getNumPublishers() > 0; });
   }
 
   void PublishTf(int scan, const std::string& frame) {
@@ -174,6 +174,8 @@ TEST_F(BadInput, MissingTfIsExplainedAndNeverGuessed) {
 
 TEST_F(BadInput, TimeThatJumpsBackStartsOver) {
   ASSERT_TRUE(LoadAndConnect("looped"));
+  ASSERT_TRUE(LoadNodelet("looped_map", "BackEndNodelet", "looped"));
+  ASSERT_TRUE(LoadNodelet("looped_graph", "PoseGraphNodelet", "looped"));
   for (int scan = 20; scan < 24; ++scan) ASSERT_TRUE(Works(scan, "lidar_c"));
   ASSERT_EQ(received_.size(), 4u);
   EXPECT_EQ(received_.back().sequence, 4u);
@@ -188,6 +190,8 @@ TEST_F(BadInput, TimeThatJumpsBackStartsOver) {
   EXPECT_NE(received_.back().session, session);
   EXPECT_LE(received_.back().sequence, 4u);
   EXPECT_TRUE(Counts("looped", "starts over"));
+  EXPECT_TRUE(Hears("the back end forgets all robots and starts over"));
+  EXPECT_TRUE(Hears("the pose graph starts over"));
 }
 
 TEST_F(BadInput, FullStateComesOnRequest) {
@@ -202,6 +206,23 @@ TEST_F(BadInput, FullStateComesOnRequest) {
   EXPECT_EQ(received_.back().sequence, 4u);
   ASSERT_TRUE(Works(4, "lidar_d"));
   EXPECT_FALSE(received_.back().full_state);
+}
+
+TEST_F(BadInput, BackEndThatComesLateAsksForAFullState) {
+  ASSERT_TRUE(LoadAndConnect("late"));
+  for (int scan = 0; scan < 3; ++scan) ASSERT_TRUE(Works(scan, "lidar_g"));
+  ASSERT_TRUE(LoadNodelet("late_map", "BackEndNodelet", "late"));
+  std::vector<StepReport> steps;
+  ros::Subscriber subscriber = nh_.subscribe<StepReport>(
+      "/late/back_end_steps", 10, [&steps](const StepReportConstPtr& m) { steps.push_back(*m); });
+  ASSERT_TRUE(WaitFor([&] { return subscriber.getNumPublishers() > 0; }));
+  ASSERT_TRUE(Works(3, "lidar_g"));
+  EXPECT_TRUE(Hears("asked for a full state", rosgraph_msgs::Log::INFO));
+  ASSERT_TRUE(Works(4, "lidar_g"));
+  EXPECT_TRUE(received_.back().full_state);
+  ASSERT_TRUE(WaitFor([&] { return !steps.empty(); }, 5.0));
+  ASSERT_EQ(steps[0].counts[0], "local_segments");
+  EXPECT_EQ(steps[0].values[0], received_.back().changed.size());
 }
 
 TEST_F(BadInput, OdometryIsInterpolatedBetweenMessages) {
@@ -286,17 +307,16 @@ TEST_F(BadInput, WrongParametersAreFatalByNameAndTheManagerLives) {
   ros::param::set("/wrong_5/front_end/local_radius_m", -3.0);
   ros::param::set("/wrong_6/display_hight_m", 1.0);
   ros::param::set("/wrong_7/pose_graph/sigma", 1.0);
-  const std::string front_end = "incremental_segmatch/FrontEndNodelet";
   const std::vector<WrongParameter> wrong{
-      {"wrong_1", front_end, "unknown parameter /wrong_1/colour"},
-      {"wrong_2", front_end, "grid.resolution"},
-      {"wrong_3", front_end, "/wrong_3/queue_size: expected an integer"},
-      {"wrong_4", front_end, "/no/such/file.yaml"},
-      {"wrong_5", front_end, "local_radius_m"},
-      {"wrong_6", "incremental_segmatch/BackEndNodelet", "unknown parameter /wrong_6/display_hight_m"},
-      {"wrong_7", "incremental_segmatch/PoseGraphNodelet", "unknown parameter /wrong_7/pose_graph/sigma"}};
+      {"wrong_1", "FrontEndNodelet", "unknown parameter /wrong_1/colour"},
+      {"wrong_2", "FrontEndNodelet", "grid.resolution"},
+      {"wrong_3", "FrontEndNodelet", "/wrong_3/queue_size: expected an integer"},
+      {"wrong_4", "FrontEndNodelet", "/no/such/file.yaml"},
+      {"wrong_5", "FrontEndNodelet", "local_radius_m"},
+      {"wrong_6", "BackEndNodelet", "unknown parameter /wrong_6/display_hight_m"},
+      {"wrong_7", "PoseGraphNodelet", "unknown parameter /wrong_7/pose_graph/sigma"}};
   for (const WrongParameter& w : wrong) {
-    ASSERT_TRUE(Load(w.nodelet, w.type)) << w.nodelet;
+    ASSERT_TRUE(LoadNodelet(w.nodelet, w.type, w.nodelet)) << w.nodelet;
     EXPECT_TRUE(Hears(w.words, rosgraph_msgs::Log::FATAL));
   }
   nodelet::NodeletList list;

@@ -2,6 +2,7 @@
 #include <geometry_msgs/PoseWithCovarianceStamped.h>
 #include <gtest/gtest.h>
 #include <incremental_segmatch/SaveMap.h>
+#include <nodelet/NodeletLoad.h>
 #include <ros/ros.h>
 #include <std_srvs/Trigger.h>
 #include <tf2_ros/buffer.h>
@@ -10,6 +11,7 @@
 #include <tf2_ros/transform_listener.h>
 
 #include <fstream>
+#include <sstream>
 #include <string>
 #include <vector>
 
@@ -88,10 +90,19 @@ class Driver {
   nav_msgs::Path path_;
 };
 
-TEST(Pipeline, ClosesTheLoopAndCorrectsTheTrajectory) {
+/// The robot drives on from test to test.
+class Pipeline : public testing::Test {
+ protected:
+  static void SetUpTestSuite() { driver_ = new Driver(); }
+  static void TearDownTestSuite() { delete driver_; }
+
+  inline static Driver* driver_ = nullptr;
+};
+
+TEST_F(Pipeline, ClosesTheLoopAndCorrectsTheTrajectory) {
   tf2_ros::Buffer tf_buffer;
   tf2_ros::TransformListener tf_listener(tf_buffer);
-  Driver driver;
+  Driver& driver = *driver_;
   ASSERT_TRUE(driver.Start());
   const SyntheticDrive& drive = driver.drive();
   for (int scan = 0; scan < drive.scans(); ++scan) ASSERT_TRUE(driver.Drive(scan)) << "no answer to scan " << scan;
@@ -155,7 +166,7 @@ TEST(Pipeline, ClosesTheLoopAndCorrectsTheTrajectory) {
   EXPECT_EQ(rows[0], "stamp_query,stamp_target,robot_query,robot_target,x,y,z,qx,qy,qz,qw,inliers,candidates,rms_m");
 }
 
-TEST(Pipeline, MapIsSavedAndAWrongPathIsExplained) {
+TEST_F(Pipeline, MapIsSavedAndAWrongPathIsExplained) {
   const std::string folder = ros::param::param<std::string>("/output_dir", "");
   SaveMap save;
   save.request.path = folder + "/town.map";
@@ -169,11 +180,48 @@ TEST(Pipeline, MapIsSavedAndAWrongPathIsExplained) {
   EXPECT_NE(save.response.message.find("no_such_folder"), std::string::npos) << save.response.message;
 }
 
+TEST_F(Pipeline, SavedMapLocalizesTheRobot) {
+  const std::string folder = ros::param::param<std::string>("/output_dir", "");
+  ros::param::set("/localizer/map_file", folder + "/town.map");
+  ros::param::set("/localizer/back_end/mode", "localization");
+  ros::param::set("/localizer/publish_tf", false);  // the pose graph does
+  nodelet::NodeletLoad load;
+  load.request.name = "/localizer";
+  load.request.type = "incremental_segmatch/BackEndNodelet";
+  for (const std::string topic : {"save_map", "load_map", "back_end_steps", "loop_closures"}) {
+    load.request.remap_source_args.push_back("/" + topic);
+    load.request.remap_target_args.push_back("/localizer/" + topic);
+  }
+  ASSERT_TRUE(ros::service::call("/manager/load_nodelet", load));
+  ros::NodeHandle nh;
+  std::vector<geometry_msgs::PoseWithCovarianceStamped> poses;
+  ros::Subscriber subscriber = nh.subscribe<geometry_msgs::PoseWithCovarianceStamped>(
+      "localization", 10, [&poses](const geometry_msgs::PoseWithCovarianceStampedConstPtr& m) { poses.push_back(*m); });
+  ASSERT_TRUE(WaitFor([&] { return subscriber.getNumPublishers() > 0; }));
+
+  const SyntheticDrive& drive = driver_->drive();
+  for (int scan = drive.scans(); scan < drive.scans() + 12; ++scan) ASSERT_TRUE(driver_->Drive(scan));
+  ASSERT_TRUE(WaitFor([&] { return poses.size() >= 3; }));
+  // The map's frame is that of the optimized first lap, so near the odometry's origin.
+  const Pose T_map_world = drive.T_world_sensor(0).inverse();
+  for (const geometry_msgs::PoseWithCovarianceStamped& pose : poses) {
+    EXPECT_EQ(pose.header.frame_id, "map");
+    const int scan =
+        static_cast<int>((ToStampNs(pose.header.stamp) - SyntheticDrive::kStartNs) / SyntheticDrive::kPeriodNs);
+    const Pose T_map_base = T_map_world * drive.T_world_sensor(scan) * BaseToSensor().inverse();
+    EXPECT_LT((ToPose(pose.pose.pose, "").translation() - T_map_base.translation()).norm(), 2.0);
+    const Covariance6 covariance = ToCovariance(pose.pose);
+    EXPECT_GT(covariance.diagonal().minCoeff(), 0.0);
+    EXPECT_LT(covariance.diagonal().maxCoeff(), 1.0);
+  }
+}
+
 }  // namespace
 }  // namespace incremental_segmatch
 
 int main(int argc, char** argv) {
   testing::InitGoogleTest(&argc, argv);
   ros::init(argc, argv, "pipeline_test");
+  ros::NodeHandle nh;  // keeps the node alive between tests
   return RUN_ALL_TESTS();
 }

@@ -57,7 +57,7 @@ class SyntheticDrive {
     for (int i = 1; i <= scan; ++i) {
       Pose step = T_world_sensor(i - 1).inverse() * T_world_sensor(i);
       step.translation() *= 1.015;
-      step.linear() = step.linear() * Eigen::AngleAxisd(0.0005, Eigen::Vector3d::UnitZ());
+      step.linear() = step.linear() * Eigen::AngleAxisd(0.002, Eigen::Vector3d::UnitZ());
       T_odom = T_odom * step;
     }
     return T_odom;
