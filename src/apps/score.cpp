@@ -16,7 +16,8 @@ namespace incremental_segmatch::apps {
 namespace {
 
 struct ScoreArguments {
-  KittiDriveOptions drive;
+  std::string root;
+  std::string sequence;
   std::string results;
   std::int64_t epoch_s = BagWriterOptions().epoch_s;
 };
@@ -40,19 +41,33 @@ void PrintScore(const Score& score, const RunErrors& errors) {
               errors.bound_same_places_m);
 }
 
+void PrintFalseClosures(const RecordedRun& run, const Score& score) {
+  for (std::size_t i = 0; i < run.closures.size(); ++i) {
+    const JudgedClosure& judged = score.judged[i];
+    if (judged.verdict != ClosureVerdict::kFalse) continue;
+    std::printf("  scan %zu to scan %zu, %zu inliers of %zu candidates: off by %.2f m and %.2f degrees\n",
+                judged.query_step, judged.target_step, run.closures[i].inliers, run.closures[i].candidates,
+                judged.translation_error_m, judged.rotation_error_deg);
+  }
+}
+
+// The scans themselves are not needed, and may be gone.
 void ScoreRun(const ScoreArguments& arguments) {
-  const KittiDrive drive(arguments.drive);
-  std::vector<StampNs> stamps_ns;
-  std::vector<Pose> truth;
-  for (std::size_t i = 0; i < drive.size(); ++i) {
-    const std::optional<Pose> pose = drive.T_world_sensor(i);
-    if (!pose) throw std::runtime_error(drive.name() + " has no ground truth: nothing can be scored");
-    stamps_ns.push_back(drive.stamp_ns(i) + arguments.epoch_s * 1'000'000'000);
-    truth.push_back(*pose);
+  const std::string folder = arguments.root + "/sequences/" + arguments.sequence;
+  const std::string poses_file = arguments.root + "/poses/" + arguments.sequence + ".txt";
+  std::vector<StampNs> stamps_ns = ReadKittiTimes(folder + "/times.txt");
+  for (StampNs& stamp_ns : stamps_ns) stamp_ns += arguments.epoch_s * 1'000'000'000;
+  const std::vector<Pose> truth =
+      SensorPosesFromCameraPoses(ReadKittiPoses(poses_file), ReadKittiCalibration(folder + "/calib.txt"));
+  if (truth.size() != stamps_ns.size()) {
+    throw std::runtime_error(poses_file + " has " + std::to_string(truth.size()) + " poses, but times.txt " +
+                             std::to_string(stamps_ns.size()) + " stamps: are they of one drive?");
   }
   const RecordedRun run = ReadRecordedRun(arguments.results);
   const Score score = ScoreClosures(stamps_ns, truth, run.closures, {});
   PrintScore(score, MeasureRun(run, stamps_ns, truth));
+  if (score.false_closures > 0) std::printf("the false closures:\n");
+  PrintFalseClosures(run, score);
   if (score.true_closures == 0) throw std::runtime_error("no loop was found");
 }
 
@@ -66,8 +81,8 @@ void AddScoreCommand(CLI::App& app) {
       "bag of segmatch kitti2bag was played, against the truth of the drive that the bag was made of. By the same\n"
       "definitions as segmatch evaluate. Fails if no loop was found.\n\n"
       "  segmatch score --kitti data --sequence 00 --results demo_results\n");
-  command->add_option("--kitti", arguments->drive.root, "folder that holds sequences/ and poses/ (ROOT)")->required();
-  command->add_option("--sequence", arguments->drive.sequence, "name of the sequence (SS)")->required();
+  command->add_option("--kitti", arguments->root, "folder that holds sequences/ and poses/ (ROOT)")->required();
+  command->add_option("--sequence", arguments->sequence, "name of the sequence (SS)")->required();
   command->add_option("--results", arguments->results, "folder that the run wrote into")
       ->required()
       ->check(CLI::ExistingDirectory);
