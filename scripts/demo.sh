@@ -8,7 +8,7 @@ usage() {
   cat <<'USAGE'
 Usage: demo.sh [--headless] [--again] [--rate R] [--out FOLDER]
 
-Needs 5 GB of disk while it simulates, and keeps 2 GB in build/demo. Ends non-zero if no loop was found.
+Needs 5 GB of disk while it simulates, and keeps 2.3 GB in build/demo. Ends non-zero if no loop was found.
 
   --headless    no rviz; without a display there is none anyway
   --again       play the drive even if nothing has changed since the last time
@@ -60,7 +60,7 @@ fi
 # The results, as long as bag, nodelets, launch files and presets are the same.
 is_up_to_date() {
   [[ -f $out/played && $out/played -nt $bag ]] || return 1
-  [[ -z $(find "$root/devel/lib" "$root/launch" "$root/config" -type f -newer "$out/played" -print -quit) ]]
+  [[ -z $(find "$root"/devel/lib/*.so "$root/launch" "$root/config" -type f -newer "$out/played" -print -quit) ]]
 }
 if ! $again && is_up_to_date; then
   echo "Nothing has changed since the drive was played last; --again plays it again."
