@@ -1,0 +1,46 @@
+# Every parameter, topic and service that the nodelets name is in docs/interfaces.md, and every launch file is in the README or
+# there.
+#   cmake -DSOURCE=... -P check_interfaces.cmake
+cmake_minimum_required(VERSION 3.16)
+file(READ ${SOURCE}/docs/interfaces.md page)
+file(READ ${SOURCE}/README.md readme)
+
+file(GLOB sources ${SOURCE}/nodelets/*.cpp)
+set(checked 0)
+foreach(source ${sources})
+  file(READ ${source} text)
+  string(REGEX MATCHALL "(reader\\.Read\\(|subscribe[^\"\n;]*\\(|advertise[^\"\n;]*\\()(prefix \\+ )?\"[a-z_0-9]+\"" names "${text}")
+  foreach(name ${names})
+    string(REGEX REPLACE ".*\"([a-z_0-9]+)\"" "\\1" name "${name}")
+    math(EXPR checked "${checked} + 1")
+    if(NOT page MATCHES "[`/]${name}`")
+      message(SEND_ERROR "${source} names ${name}, docs/interfaces.md does not")
+    endif()
+  endforeach()
+endforeach()
+if(checked LESS 40)
+  message(SEND_ERROR "only ${checked} names were found in nodelets/: this check no longer understands the sources")
+endif()
+
+file(GLOB launch_files RELATIVE ${SOURCE}/launch ${SOURCE}/launch/*.launch)
+foreach(launch_file ${launch_files})
+  if(NOT "${page}${readme}" MATCHES "${launch_file}" AND NOT launch_file STREQUAL "demo.launch")
+    message(SEND_ERROR "neither README.md nor docs/interfaces.md mentions ${launch_file}")
+  endif()
+endforeach()
+
+# No link of a page leads nowhere.
+file(GLOB pages RELATIVE ${SOURCE} ${SOURCE}/*.md ${SOURCE}/docs/*.md)
+foreach(name ${pages})
+  file(READ ${SOURCE}/${name} text)
+  get_filename_component(folder ${SOURCE}/${name} DIRECTORY)
+  string(REPLACE "](" "@link@" text "${text}")  # CMake's lists don't like brackets
+  string(REGEX REPLACE "[][;]" "" text "${text}")
+  string(REGEX MATCHALL "@link@[^)#]+" links "${text}")
+  foreach(link ${links})
+    string(REPLACE "@link@" "" link "${link}")
+    if(NOT link MATCHES "^https?:" AND NOT link MATCHES "[&\" ]" AND NOT EXISTS "${folder}/${link}")
+      message(SEND_ERROR "${name} links to ${link}, which does not exist")
+    endif()
+  endforeach()
+endforeach()
