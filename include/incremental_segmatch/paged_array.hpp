@@ -1,0 +1,51 @@
+/// \file
+/// Array that grows without moving its elements, on huge pages where the system has them.
+#pragma once
+
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
+
+#include <cstddef>
+#include <memory>
+#include <new>
+#include <type_traits>
+#include <vector>
+
+namespace incremental_segmatch {
+
+/// Elements stay where they are for the array's life. Memory is asked for in 2 MB pages: elements that are visited in no order miss
+/// the caches of address translation otherwise. O(1) access; growing is O(new elements). For large, trivially destructible types.
+template <class T>
+class PagedArray {
+  static_assert(std::is_trivially_destructible_v<T>, "elements are not destroyed one by one");
+
+ public:
+  std::size_t size() const { return pages_.size() * kPerPage; }
+  std::size_t memory_bytes() const { return pages_.size() * kPageBytes; }
+  T& operator[](std::size_t i) { return pages_[i / kPerPage].get()[i % kPerPage]; }
+  const T& operator[](std::size_t i) const { return pages_[i / kPerPage].get()[i % kPerPage]; }
+
+  /// Makes room for at least this many elements; new ones are value-initialized.
+  void Grow(std::size_t size) {
+    while (this->size() < size) {
+      void* memory = ::operator new(kPageBytes, std::align_val_t{kHugePage});
+#if defined(__linux__)
+      madvise(memory, kPageBytes, MADV_HUGEPAGE);  // advice: works without
+#endif
+      pages_.emplace_back(static_cast<T*>(memory));
+      for (std::size_t i = 0; i < kPerPage; ++i) new (pages_.back().get() + i) T();
+    }
+  }
+
+ private:
+  static constexpr std::size_t kHugePage = std::size_t{1} << 21;
+  static constexpr std::size_t kPerPage = 1024;
+  static constexpr std::size_t kPageBytes = (kPerPage * sizeof(T) + kHugePage - 1) / kHugePage * kHugePage;
+  struct Free {
+    void operator()(T* memory) const { ::operator delete(memory, std::align_val_t{kHugePage}); }
+  };
+  std::vector<std::unique_ptr<T, Free>> pages_;
+};
+
+}  // namespace incremental_segmatch
