@@ -14,7 +14,7 @@
 namespace incremental_segmatch {
 
 /// Undirected graph over correspondences 0..n-1 in compressed rows: the neighbours of v are
-/// `neighbours[offsets[v] .. offsets[v + 1])`, sorted by index, no self loops, every edge in both rows.
+/// neighbours[k] for offsets[v] <= k < offsets[v + 1], sorted by index, no self loops, every edge in both rows.
 struct ConsistencyGraph {
   /// The neighbours of one vertex.
   struct Range {

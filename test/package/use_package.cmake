@@ -1,6 +1,6 @@
 # Builds the program of program/ against an installed or built package, and runs it on a simulated drive.
-#   cmake -DSOURCE=... -DBUILD=... -DPACKAGE_DIR=... -DSEGMATCH=... -P use_package.cmake
-# SOURCE: folder of the program. BUILD: scratch folder. PACKAGE_DIR: folder of incremental_segmatchConfig.cmake.
+#   cmake -DSOURCE=... -DBUILD=... -DPREFIX=... -DSEGMATCH=... -P use_package.cmake
+# SOURCE: folder of the program. BUILD: scratch folder. PREFIX: install prefix or devel space.
 # SEGMATCH: the program segmatch.
 cmake_minimum_required(VERSION 3.16)
 
@@ -12,7 +12,7 @@ function(run)
 endfunction()
 
 file(REMOVE_RECURSE ${BUILD})
-run(${CMAKE_COMMAND} -S ${SOURCE} -B ${BUILD} -DCMAKE_BUILD_TYPE=Debug -Dincremental_segmatch_DIR=${PACKAGE_DIR}
+run(${CMAKE_COMMAND} -S ${SOURCE} -B ${BUILD} -DCMAKE_BUILD_TYPE=Debug -DCMAKE_PREFIX_PATH=${PREFIX}
     -DPYTHON_EXECUTABLE=/usr/bin/python3 -DPython3_EXECUTABLE=/usr/bin/python3)
 run(${CMAKE_COMMAND} --build ${BUILD})
 run(${SEGMATCH} simulate --out ${BUILD}/drive --sensor VLP-16 --max-scans 3)
