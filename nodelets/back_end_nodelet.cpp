@@ -17,9 +17,9 @@ namespace {
 constexpr double kWarnPeriod_s = 5.0;
 constexpr double kRequestPeriod_s = 1.0;
 
-const LineStyle kCandidateStyle{"candidates", 0.6f, 0.6f, 0.6f, 0.25f, 0.05};
-const LineStyle kAcceptedStyle{"accepted", 0.1f, 0.9f, 0.2f, 1.0f, 0.25};
-const LineStyle kClosureStyle{"closures", 1.0f, 0.85f, 0.1f, 1.0f, 0.4};
+const LineStyle kCandidateStyle{"candidates", 0.7f, 0.7f, 0.75f, 0.07f, 0.05};
+const LineStyle kAcceptedStyle{"accepted", 0.1f, 0.9f, 0.2f, 1.0f, 0.2};
+const LineStyle kClosureStyle{"closures", 1.0f, 0.85f, 0.1f, 1.0f, 0.25};
 
 /// Index in the map of a robot of this run: the last of that name, since those of a loaded map come first.
 std::optional<RobotIndex> FindRobot(const TargetMap& map, const std::string& name) {

@@ -58,6 +58,11 @@ Covariance6 Adjoint(const Pose& T) {
   return adjoint;
 }
 
+/// To the nearest; in range, and inline, which std::lround is not.
+std::int16_t RoundToInt16(float value) {
+  return static_cast<std::int16_t>(value + std::copysign(0.5f, value));
+}
+
 void QuantisePoints(const Points& points, double unit_m, Segment* message) {
   float largest = 0.f;
   for (const Eigen::Vector3f& p : points) largest = std::max(largest, p.cwiseAbs().maxCoeff());
@@ -66,7 +71,7 @@ void QuantisePoints(const Points& points, double unit_m, Segment* message) {
   message->points.resize(3 * points.size());
   auto out = message->points.begin();
   for (const Eigen::Vector3f& p : points)
-    for (int axis = 0; axis < 3; ++axis) *out++ = static_cast<std::int16_t>(std::lround(p[axis] * scale));
+    for (int axis = 0; axis < 3; ++axis) *out++ = RoundToInt16(p[axis] * scale);
 }
 
 std::shared_ptr<const Points> RestorePoints(const Segment& message) {

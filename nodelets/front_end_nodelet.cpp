@@ -78,7 +78,10 @@ void FrontEndNodelet::OnCloud(const sensor_msgs::PointCloud2ConstPtr& cloud) {
     const std::lock_guard<std::mutex> lock(mutex_);
     ++status_.received;
   }
+  const std::size_t dropped = worker_->dropped();
   worker_->Post([this, cloud, received = Clock::now()] { ProcessCloud(*cloud, received); });
+  if (worker_->dropped() > dropped && throttle_.IsDue("dropped", kWarnPeriod_s))
+    NODELET_WARN("%zu scans dropped so far: they come faster than they are processed", worker_->dropped());
 }
 
 void FrontEndNodelet::OnOdometry(const nav_msgs::OdometryConstPtr& odometry) {

@@ -73,6 +73,7 @@ class SubtreeReader {
     throw std::invalid_argument("unknown parameter " + unknown + "; those of " + path_ + " are: " + list);
   }
 
+  const std::string& path() const { return path_; }
   std::string Full(const std::string& name) const { return path_ + "/" + name; }
 
   void Require(bool condition, const std::string& name, const std::string& what) const {
@@ -133,7 +134,7 @@ Parameters ReadCore(SubtreeReader& reader, const std::string& subtree_name) {
                                 " are both set: give the one or the other");
   if (!config_file.empty()) return LoadParameters(config_file);
   if (subtree == nullptr) return ParseParameters("{}", reader.Full(subtree_name));
-  return ParseParameters("{" + subtree_name + ": " + ToYamlText(*subtree) + "}", reader.Full(""));
+  return ParseParameters("{" + subtree_name + ": " + ToYamlText(*subtree) + "}", reader.path());
 }
 
 const std::vector<std::pair<std::string, FrameKind>> kFrameKinds{{"base", FrameKind::kBase},
