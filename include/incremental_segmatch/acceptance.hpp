@@ -10,37 +10,47 @@
 
 namespace incremental_segmatch {
 
+/// What evidence a recognition must have.
 struct AcceptanceParameters {
-  double support_distance_m = 1.0;      ///< a local segment is supported by a target segment this near, under the recognised transform
-  double neighbourhood_m = 10.0;        ///< and is expected to be, where any target segment is this near: the map was seen there
-  double min_coverage = 0.25;           ///< least share of the expected local segments that are supported
-  std::size_t min_margin = 1;           ///< inliers must outnumber the best clique beside them by so many
-  double max_distance_m = 20.0;         ///< of the query from the pose its target was seen from: odometry drifts in between
-  double max_sigma_m = 0.5;             ///< largest standard deviation of the query's position, along its worst axis
-  double max_sigma_rad = 0.02;          ///< the same of its orientation
+  double support_distance_m =
+      1.0;  ///< a local segment is supported by a target segment this near, under the recognised transform
+  double neighbourhood_m =
+      10.0;                    ///< and is expected to be, where any target segment is this near: the map was seen there
+  double min_coverage = 0.25;  ///< least share of the expected local segments that are supported
+  std::size_t min_margin = 1;  ///< inliers must outnumber the best clique beside them by so many
+  double max_distance_m = 20.0;  ///< of the query from the pose its target was seen from: odometry drifts in between
+  double max_sigma_m = 0.5;      ///< largest standard deviation of the query's position, along its worst axis
+  double max_sigma_rad = 0.02;   ///< the same of its orientation
 };
 
 /// What speaks for and against a recognition.
 struct Evidence {
-  std::size_t inliers = 0;
-  std::size_t runner_up = 0;   ///< size of the best clique that shares no correspondence with the inliers
-  std::size_t expected = 0;    ///< local segments where the map was seen
-  std::size_t supported = 0;   ///< of them, those with a target segment in their place
-  double overlap = 0.0;        ///< share of the inlier segments' points that lie on points of their targets; 0 without refinement
-  double sigma_m = 0.0;        ///< standard deviation of the query's position, along its worst axis
-  double sigma_rad = 0.0;      ///< and of its orientation
+  std::size_t inliers = 0;    ///< matches that agree
+  std::size_t runner_up = 0;  ///< size of the best clique that shares no correspondence with the inliers
+  std::size_t expected = 0;   ///< local segments where the map was seen
+  std::size_t supported = 0;  ///< of them, those with a target segment in their place
+  double overlap =
+      0.0;  ///< share of the inlier segments' points that lie on points of their targets; 0 without refinement
+  double sigma_m = 0.0;    ///< standard deviation of the query's position, along its worst axis
+  double sigma_rad = 0.0;  ///< and of its orientation
 
-  double distance_m = 0.0;     ///< between the two sensor poses of the closure
+  double distance_m = 0.0;  ///< between the two sensor poses of the closure
 
-  double Coverage() const { return expected == 0 ? 0.0 : static_cast<double>(supported) / static_cast<double>(expected); }
+  /// Share of what should be seen that is seen; 0 where nothing is expected.
+  double Coverage() const {
+    return expected == 0 ? 0.0 : static_cast<double>(supported) / static_cast<double>(expected);
+  }
 };
 
 /// Counts expected and supported segments. Both lists in the map's frame. O(local * targets).
-void MeasureCoverage(const std::vector<Eigen::Vector3d>& centroids_local, const std::vector<Eigen::Vector3d>& centroids_target,
-                     const AcceptanceParameters& parameters, Evidence* evidence);
+void MeasureCoverage(const std::vector<Eigen::Vector3d>& centroids_local,
+                     const std::vector<Eigen::Vector3d>& centroids_target, const AcceptanceParameters& parameters,
+                     Evidence* evidence);
 
+/// Whether a recognition is accepted, or why not.
 enum class Verdict { kAccepted, kAmbiguous, kUncovered, kUncertain, kTooFar };
 
+/// Judges the evidence. O(1).
 Verdict Judge(const Evidence& evidence, const AcceptanceParameters& parameters);
 
 /// Throws std::invalid_argument naming the parameter that is out of range.

@@ -19,85 +19,105 @@
 
 namespace incremental_segmatch {
 
+/// What the target map is.
 enum class Mode {
   kLoopClosure,  ///< the target map is what the robots of this run have seen so far
   kLocalization  ///< the target map is loaded and fixed
 };
 
+/// Which target segments are candidates of a local one.
 struct MatchingParameters {
-  int nearest = 25;                  ///< candidates of a local segment: so many nearest; 0: no limit
-  double max_distance = 0.0;         ///< and within this scaled descriptor distance; 0: no limit
-  double time_window_s = 60.0;       ///< own segments seen more recently are no targets (loop closure)
-  double min_path_m = 50.0;          ///< nor are those seen less than this much of path ago
-  double requery_distance = 0.2;     ///< a segment is matched anew once its scaled descriptor moved so far
+  int nearest = 25;               ///< candidates of a local segment: so many nearest; 0: no limit
+  double max_distance = 0.0;      ///< and within this scaled descriptor distance; 0: no limit
+  double time_window_s = 60.0;    ///< own segments seen more recently are no targets (loop closure)
+  double min_path_m = 50.0;       ///< nor are those seen less than this much of path ago
+  double requery_distance = 0.2;  ///< a segment is matched anew once its scaled descriptor moved so far
 };
 
-/// Which points of the matched segments refine a recognition: the nearer they are to the sensor, the less has odometry drifted
-/// between them and the closure's two poses.
+/// Which points of the matched segments refine a recognition: the nearer they are to the sensor, the less has odometry
+/// drifted between them and the closure's two poses.
 struct NearPointsParameters {
-  double radius_m = 25.0;            ///< points so near to the query's sensor are used, if they are enough
-  std::size_t min_points = 1500;     ///< if not, the radius is doubled until they are, or all are in
+  double radius_m = 25.0;         ///< points so near to the query's sensor are used, if they are enough
+  std::size_t min_points = 1500;  ///< if not, the radius is doubled until they are, or all are in
 };
 
+/// Of the map side.
 struct BackEndParameters {
-  Mode mode = Mode::kLoopClosure;
-  MatchingParameters matching;
-  RecognizerParameters recognizer;
-  NearPointsParameters near_points;
-  RefinementParameters refinement;
-  AcceptanceParameters acceptance;
-  TargetMapParameters target_map;
+  Mode mode = Mode::kLoopClosure;    ///< loop closure or localization
+  MatchingParameters matching;       ///< candidates of a local segment
+  RecognizerParameters recognizer;   ///< candidates to a transform
+  NearPointsParameters near_points;  ///< which points refine
+  RefinementParameters refinement;   ///< the transform on the segments' points
+  AcceptanceParameters acceptance;   ///< evidence that a recognition must have
+  TargetMapParameters target_map;    ///< what is kept
 };
 
 /// A matched pair of segments, for evidence and display.
 struct SegmentMatch {
-  SegmentKey local;
-  SegmentKey target;
-  Eigen::Vector3d centroid_local_odom = Eigen::Vector3d::Zero();
-  Eigen::Vector3d centroid_target_map = Eigen::Vector3d::Zero();
+  SegmentKey local;                                               ///< of the query robot's local map
+  SegmentKey target;                                              ///< of the target map
+  Eigen::Vector3d centroid_local_odom = Eigen::Vector3d::Zero();  ///< in the query robot's odometry frame
+  Eigen::Vector3d centroid_target_map = Eigen::Vector3d::Zero();  ///< in the map
 };
 
 /// Relative pose of two sensor poses: what every pose graph takes.
 struct LoopClosure {
-  StampNs stamp_query_ns = 0;
-  StampNs stamp_target_ns = 0;
-  std::string robot_query;
-  std::string robot_target;
-  Pose T_target_query = Pose::Identity();              ///< pose of the query's sensor in the target sensor's frame
-  Covariance6 covariance = Covariance6::Identity();    ///< of T_target_query, ROS's order, perturbation on the right: T exp(xi)
-  std::size_t inliers = 0;
-  std::size_t candidates = 0;
-  double rms_m = 0.0;                                  ///< residual of the inliers' centroids
-  Evidence evidence;
-  Pose T_map_odom = Pose::Identity();                  ///< where this recognition puts the query's odom frame
-  std::vector<SegmentMatch> matches;                   ///< the inliers
+  StampNs stamp_query_ns = 0;              ///< of the newer pose: the scan that recognised the place
+  StampNs stamp_target_ns = 0;             ///< of the older pose, from which matched segments were seen
+  std::string robot_query;                 ///< whose scan it was
+  std::string robot_target;                ///< whose trajectory the older pose belongs to
+  Pose T_target_query = Pose::Identity();  ///< pose of the query's sensor in the target sensor's frame
+  Covariance6 covariance =
+      Covariance6::Identity();         ///< of T_target_query, ROS's order, perturbation on the right: T exp(xi)
+  std::size_t inliers = 0;             ///< matches that agree
+  std::size_t candidates = 0;          ///< matches of which these agree
+  double rms_m = 0.0;                  ///< residual of the inliers' centroids
+  Evidence evidence;                   ///< what it was judged by
+  Pose T_map_odom = Pose::Identity();  ///< where this recognition puts the query's odom frame
+  std::vector<SegmentMatch> matches;   ///< the inliers
 };
 
 /// The stage that ended a step: why no loop here?
-enum class StepEnd { kRecognized, kNoSegments, kNoTargets, kTooFewCandidates, kCliqueTooSmall, kDegenerate, kTilted, kLargeResidual,
-                     kNotRefined, kTooYoung, kAmbiguous, kUncovered, kUncertain, kTooFar };
+enum class StepEnd {
+  kRecognized,
+  kNoSegments,
+  kNoTargets,
+  kTooFewCandidates,
+  kCliqueTooSmall,
+  kDegenerate,
+  kTilted,
+  kLargeResidual,
+  kNotRefined,
+  kTooYoung,
+  kAmbiguous,
+  kUncovered,
+  kUncertain,
+  kTooFar
+};
+/// The name as in steps.csv and StepReport.msg.
 const char* ToString(StepEnd end);
 
 /// The map side's part of the funnel.
 struct BackEndCounts {
-  std::size_t local_segments = 0;
-  std::size_t target_segments = 0;      ///< in the map
-  std::size_t allowed_targets = 0;      ///< of them, open to matching
-  std::size_t requeried = 0;            ///< local segments that were matched anew
-  std::size_t candidates = 0;
-  std::size_t tested_pairs = 0;
-  std::size_t edges = 0;
-  std::size_t clique = 0;
-  std::optional<Evidence> evidence;     ///< of a recognition that was judged, accepted or not
-  StepEnd end = StepEnd::kNoSegments;
+  std::size_t local_segments = 0;      ///< tracked by the robot
+  std::size_t target_segments = 0;     ///< in the map
+  std::size_t allowed_targets = 0;     ///< of them, open to matching
+  std::size_t requeried = 0;           ///< local segments that were matched anew
+  std::size_t candidates = 0;          ///< matches that entered recognition
+  std::size_t tested_pairs = 0;        ///< of candidates, for consistency
+  std::size_t edges = 0;               ///< consistent pairs
+  std::size_t clique = 0;              ///< size of the largest consistent set
+  std::optional<Evidence> evidence;    ///< of a recognition that was judged, accepted or not
+  StepEnd end = StepEnd::kNoSegments;  ///< the stage that ended the step
 };
 
+/// What came of one delta.
 struct BackEndStep {
-  std::optional<LoopClosure> closure;
-  bool missed_delta = false;            ///< a delta is missing: ask the robot for a full state; this one was not applied
-  std::vector<SegmentMatch> candidates; ///< all that entered recognition
-  BackEndCounts counts;
-  StageTimes times;
+  std::optional<LoopClosure> closure;  ///< the place, if one was recognised
+  bool missed_delta = false;           ///< a delta is missing: ask the robot for a full state; this one was not applied
+  std::vector<SegmentMatch> candidates;  ///< all that entered recognition
+  BackEndCounts counts;                  ///< the funnel
+  StageTimes times;                      ///< of this step
 };
 
 /// Recognises places. Synchronous; not thread-safe.
@@ -114,8 +134,11 @@ class BackEnd {
   /// The corrected trajectory of a robot (sensor poses in the map): its target segments move along. O(map).
   void CorrectTrajectory(const std::string& robot, const std::vector<StampedPose>& T_map_sensor);
 
+  /// The target map.
   const TargetMap& map() const { return map_; }
+  /// As given to the constructor.
   const BackEndParameters& parameters() const { return parameters_; }
+  /// Memory held, about. O(map).
   std::size_t memory_bytes() const;
 
  private:
@@ -125,21 +148,21 @@ class BackEnd {
     Descriptor descriptor;
     StampNs last_seen_ns = 0;
     double last_seen_path_m = 0.0;
-    std::shared_ptr<const Points> points_centroid;                       // of its newest view
-    Eigen::Vector3d points_origin_odom = Eigen::Vector3d::Zero();        // what those points are relative to
-    std::optional<SegmentKey> same_as;                                   // target segment that it was recognised as
-    Descriptor queried;                                                  // descriptor at the last query; empty: never
+    std::shared_ptr<const Points> points_centroid;                 // of its newest view
+    Eigen::Vector3d points_origin_odom = Eigen::Vector3d::Zero();  // what those points are relative to
+    std::optional<SegmentKey> same_as;                             // target segment that it was recognised as
+    Descriptor queried;                                            // descriptor at the last query; empty: never
     std::uint64_t queried_generation = 0;
-    std::uint64_t next_item = 0;                                         // of the index at the last look
-    std::vector<TargetCandidate> candidates;                             // nearest first
+    std::uint64_t next_item = 0;              // of the index at the last look
+    std::vector<TargetCandidate> candidates;  // nearest first
   };
   struct Robot {
     std::string name;
-    RobotIndex frame = 0;                                                // robots with the same value share a map frame
+    RobotIndex frame = 0;  // robots with the same value share a map frame
     bool started = false;
     std::uint64_t sequence = 0;
     double path_m = 0.0;
-    std::vector<double> path_at_pose_m;                                  // in loop closure, by index of trajectory pose
+    std::vector<double> path_at_pose_m;  // in loop closure, by index of trajectory pose
     Pose T_odom_sensor = Pose::Identity();
     std::map<SegmentId, LocalSegment> local;
   };
@@ -173,9 +196,9 @@ class BackEnd {
   TargetMap map_;
   TargetIndex index_;
   std::map<std::pair<RobotIndex, RobotIndex>, Recognizer> recognizers_;  // by robot and frame of its targets
-  std::vector<Robot> robots_;                                            // by RobotIndex; those of a loaded map come first
+  std::vector<Robot> robots_;  // by RobotIndex; those of a loaded map come first
   RobotIndex loaded_robots_ = 0;
-  std::multimap<StampNs, Waiting> waiting_;                              // by when they were last seen
+  std::multimap<StampNs, Waiting> waiting_;  // by when they were last seen
 };
 
 }  // namespace incremental_segmatch

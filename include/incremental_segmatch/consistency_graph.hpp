@@ -18,20 +18,26 @@ namespace incremental_segmatch {
 struct ConsistencyGraph {
   /// The neighbours of one vertex.
   struct Range {
-    const std::uint32_t* first = nullptr;
-    const std::uint32_t* last = nullptr;
+    const std::uint32_t* first = nullptr;  ///< the first neighbour
+    const std::uint32_t* last = nullptr;   ///< behind the last one
+    /// For loops.
     const std::uint32_t* begin() const { return first; }
+    /// For loops.
     const std::uint32_t* end() const { return last; }
+    /// Number of neighbours.
     std::size_t size() const { return static_cast<std::size_t>(last - first); }
   };
+  /// Two vertices.
   using Edge = std::pair<std::uint32_t, std::uint32_t>;
 
   std::vector<std::size_t> offsets{0};    ///< vertices() + 1 entries
   std::vector<std::uint32_t> neighbours;  ///< 2 * edges entries
   std::uint64_t tested_pairs = 0;         ///< how many pairs were tested for consistency
-  std::size_t edges = 0;
+  std::size_t edges = 0;                  ///< number of edges, each counted once
 
+  /// Number of vertices.
   std::size_t vertices() const { return offsets.size() - 1; }
+  /// Neighbours of a vertex, ascending. O(1).
   Range Neighbours(std::uint32_t vertex) const {
     return {neighbours.data() + offsets[vertex], neighbours.data() + offsets[vertex + 1]};
   }
@@ -51,6 +57,7 @@ enum class ConsistencyMethod {
   kAuto            ///< whichever of the others measured fastest in the last calls
 };
 
+/// When two correspondences agree, and how that is found out.
 struct ConsistencyParameters {
   double epsilon_m = 0.4;                                        ///< tolerance of (2.3), > 0
   ConsistencyMethod method = ConsistencyMethod::kPartitioned2D;  ///< all give the same graph
@@ -87,7 +94,9 @@ class ConsistencyGraphBuilder {
   /// Throws std::invalid_argument naming the parameter that is out of range.
   explicit ConsistencyGraphBuilder(const ConsistencyParameters& parameters);
   ~ConsistencyGraphBuilder();
+  /// Moves; what was moved from can only be assigned to or destroyed.
   ConsistencyGraphBuilder(ConsistencyGraphBuilder&&) noexcept;
+  /// Moves likewise.
   ConsistencyGraphBuilder& operator=(ConsistencyGraphBuilder&&) noexcept;
 
   /// Vertex i of the graph is correspondences[i]. A correspondence without usable coordinates has no edges.

@@ -1,5 +1,6 @@
 /// \file
-/// Dynamic voxel grid (METHOD 1; thesis 3.1): incremental downsampling with stable handles and neighbours from the grid itself.
+/// Dynamic voxel grid (METHOD 1; thesis 3.1): incremental downsampling with stable handles and neighbours from the grid
+/// itself.
 #pragma once
 
 #include <array>
@@ -13,6 +14,7 @@
 
 namespace incremental_segmatch {
 
+/// Of the grid.
 struct DynamicVoxelGridParameters {
   double resolution_m = 0.1;                      ///< side of a voxel
   int min_points_per_voxel = 1;                   ///< a voxel is active, and goes downstream, from this many points on
@@ -20,16 +22,19 @@ struct DynamicVoxelGridParameters {
   std::array<double, 3> center_m{0.0, 0.0, 0.0};  ///< o of (3.3): centre of the covered volume, in the grid's frame
 };
 
-/// A voxel whose centroid moved. Coordinates are relative to the corner of the voxel's block (DynamicVoxelGrid::BlockCorner).
+/// A voxel whose centroid moved. Coordinates are relative to the corner of the voxel's block
+/// (DynamicVoxelGrid::BlockCorner).
 struct MovedVoxel {
-  VoxelHandle voxel = 0;
+  VoxelHandle voxel = 0;  ///< which voxel
+  /// Its centroid before, relative to the corner of its block (m).
   Eigen::Vector3f before_block = Eigen::Vector3f::Zero();
-  Eigen::Vector3f after_block = Eigen::Vector3f::Zero();
+  Eigen::Vector3f after_block = Eigen::Vector3f::Zero();  ///< its centroid now, likewise (m)
 };
 
 /// A voxel that left. Its handle is free from the next call of the grid on.
 struct RemovedVoxel {
-  VoxelHandle voxel = 0;
+  VoxelHandle voxel = 0;  ///< which voxel; the handle may be given to another one later
+  /// Its last centroid, relative to the corner of its block (m).
   Eigen::Vector3f centroid_block = Eigen::Vector3f::Zero();
 };
 
@@ -43,19 +48,22 @@ struct VoxelUpdate {
   std::size_t dropped_outside = 0;     ///< points outside the covered volume
 };
 
-/// Cells of the neighbourhood of a radius, prepared once: for each of the 64 cells of a block, which neighbouring blocks to
-/// visit and which of their cells can hold a point within the radius.
+/// Cells of the neighbourhood of a radius, prepared once: for each of the 64 cells of a block, which neighbouring
+/// blocks to visit and which of their cells can hold a point within the radius.
 class NeighbourStencil {
  public:
   /// Throws std::invalid_argument unless 0 < radius_m <= 16 resolution_m.
   NeighbourStencil(double radius_m, double resolution_m);
 
+  /// A block to look into, and which of its cells.
   struct BlockVisit {
     std::array<std::int8_t, 3> offset{};  ///< in blocks
     std::int16_t link = -1;               ///< index of an adjacent block's link, -1 if it must be looked up
     std::uint64_t cells = 0;              ///< candidates within that block
   };
+  /// Blocks that hold cells within the radius of a cell of a block (0 to 63).
   const std::vector<BlockVisit>& visits(unsigned cell) const { return visits_[cell]; }
+  /// The radius.
   double radius_m() const { return radius_m_; }
 
  private:
@@ -74,13 +82,15 @@ class NeighbourStencil {
 /// O(voxels in the stencil). Not thread-safe.
 class DynamicVoxelGrid {
  public:
-  static constexpr int kBlockSide = 4;             ///< cells along a block's side
-  static constexpr VoxelHandle kCellsPerBlock = 64;
+  static constexpr int kBlockSide = 4;               ///< cells along a block's side
+  static constexpr VoxelHandle kCellsPerBlock = 64;  ///< 4 x 4 x 4
 
   /// Throws std::invalid_argument naming the parameter that is out of range.
   explicit DynamicVoxelGrid(const DynamicVoxelGridParameters& parameters);
   ~DynamicVoxelGrid();
+  /// Moves; what was moved from can only be assigned to or destroyed.
   DynamicVoxelGrid(DynamicVoxelGrid&&) noexcept;
+  /// Moves likewise.
   DynamicVoxelGrid& operator=(DynamicVoxelGrid&&) noexcept;
 
   /// Inserts points (3.2-3.4): c <- (n c + sum p) / (n + m), n <- n + m. Points that are not finite or lie outside the
@@ -93,16 +103,22 @@ class DynamicVoxelGrid {
   /// Rigid transform of everything: T_g <- T_new_old T_g.
   void Transform(const Pose& T_new_old) { T_odom_grid_ = T_new_old * T_odom_grid_; }
 
+  /// Pose of the grid's own frame in odom.
   const Pose& T_odom_grid() const { return T_odom_grid_; }
+  /// As given to the constructor.
   const DynamicVoxelGridParameters& parameters() const { return parameters_; }
+  /// Voxels with enough points. O(1).
   std::size_t active_voxels() const { return active_voxels_; }
+  /// Voxels with any point. O(1).
   std::size_t occupied_voxels() const { return occupied_voxels_; }
   /// One more than the largest handle that was ever given out: the size of a consumer's array over handles.
   std::size_t handle_capacity() const;
   /// Bytes held by the grid.
   std::size_t memory_bytes() const;
 
+  /// True if the voxel has enough points. O(1).
   bool IsActive(VoxelHandle voxel) const;
+  /// Points in a voxel. O(1).
   std::uint32_t PointCount(VoxelHandle voxel) const;
   /// Lower corner of the block that the voxel belongs to, in the grid's frame (exact multiples of 4 cells).
   Eigen::Vector3d BlockCorner(VoxelHandle voxel) const {
@@ -116,7 +132,10 @@ class DynamicVoxelGrid {
     return block(voxel / kCellsPerBlock).voxels[voxel % kCellsPerBlock].centroid_block;
   }
   /// Centroid in the grid's frame.
-  Eigen::Vector3d CentroidGrid(VoxelHandle voxel) const { return BlockCorner(voxel) + CentroidInBlock(voxel).cast<double>(); }
+  Eigen::Vector3d CentroidGrid(VoxelHandle voxel) const {
+    return BlockCorner(voxel) + CentroidInBlock(voxel).cast<double>();
+  }
+  /// Centroid in odom (m). O(1).
   Eigen::Vector3d CentroidOdom(VoxelHandle voxel) const { return T_odom_grid_ * CentroidGrid(voxel); }
 
   /// Handles of all active voxels, block by block. O(local cloud): for inspection, not for a step.
@@ -127,15 +146,16 @@ class DynamicVoxelGrid {
   template <class Visit>
   void ForEachNeighbour(const NeighbourStencil& stencil, VoxelHandle voxel, Visit&& visit) const;
 
-  /// The same a block at a time, for consumers that can settle many voxels at once: calls visit(slot, cells, shift) for each
-  /// block that may hold neighbours. Handles are slot * kCellsPerBlock + cell for the set bits of cells (active voxels, this one
-  /// included); CentroidInBlock(handle) + shift is the difference to this voxel's centroid, still to be held against the radius.
+  /// The same a block at a time, for consumers that can settle many voxels at once: calls visit(slot, cells, shift) for
+  /// each block that may hold neighbours. Handles are slot * kCellsPerBlock + cell for the set bits of cells (active
+  /// voxels, this one included); CentroidInBlock(handle) + shift is the difference to this voxel's centroid, still to
+  /// be held against the radius.
   template <class Visit>
   void ForEachNeighbourBlock(const NeighbourStencil& stencil, VoxelHandle voxel, Visit&& visit) const;
 
-  /// The blocks themselves, for consumers that keep voxels of their own by handle: calls visit(slot, block_visit) for each block
-  /// that the stencil around the voxel reaches; visit returns false to stop. Of a voxel that the last call removed, it still
-  /// finds all blocks that stayed.
+  /// The blocks themselves, for consumers that keep voxels of their own by handle: calls visit(slot, block_visit) for
+  /// each block that the stencil around the voxel reaches; visit returns false to stop. Of a voxel that the last call
+  /// removed, it still finds all blocks that stayed.
   template <class Visit>
   void ForEachStencilBlock(const NeighbourStencil& stencil, VoxelHandle voxel, Visit&& visit) const;
 
@@ -168,8 +188,8 @@ class DynamicVoxelGrid {
     std::uint32_t cell;
     std::uint32_t slot;
   };
-  std::size_t Locate(const Eigen::Vector3f* points_sensor, std::size_t count, const Pose& T_grid_sensor, Located* located,
-                     VoxelUpdate* update) const;
+  std::size_t Locate(const Eigen::Vector3f* points_sensor, std::size_t count, const Pose& T_grid_sensor,
+                     Located* located, VoxelUpdate* update) const;
   void AddPoint(const Located& point);
   void CollectTouched(VoxelUpdate* update);
   std::uint32_t FindBlock(const std::array<std::int32_t, 3>& coordinates) const;
@@ -181,7 +201,7 @@ class DynamicVoxelGrid {
   float block_size_m_ = 0.f;
   Pose T_odom_grid_ = Pose::Identity();
   std::vector<std::unique_ptr<Block[]>> pages_;
-  std::uint32_t block_slots_ = 0;            ///< slots ever used
+  std::uint32_t block_slots_ = 0;  ///< slots ever used
   std::vector<std::uint32_t> free_blocks_;
   std::unique_ptr<BlockMap> block_map_;
   std::unique_ptr<TileMap> tiles_;
@@ -193,17 +213,17 @@ class DynamicVoxelGrid {
     bool was_active;
     Eigen::Vector3f before_block;
   };
-  std::vector<Touched> touched_;             ///< work space of Insert
+  std::vector<Touched> touched_;  ///< work space of Insert
 };
 
 template <class Visit>
 void DynamicVoxelGrid::ForEachStencilBlock(const NeighbourStencil& stencil, VoxelHandle voxel, Visit&& visit) const {
   const Block& home = block(voxel / kCellsPerBlock);
   for (const NeighbourStencil::BlockVisit& at : stencil.visits(voxel % kCellsPerBlock)) {
-    const std::uint32_t slot =
-        at.link >= 0 ? home.links[at.link]
-                     : FindBlock({home.coordinates[0] + at.offset[0], home.coordinates[1] + at.offset[1],
-                                  home.coordinates[2] + at.offset[2]});
+    const std::uint32_t slot = at.link >= 0
+                                   ? home.links[at.link]
+                                   : FindBlock({home.coordinates[0] + at.offset[0], home.coordinates[1] + at.offset[1],
+                                                home.coordinates[2] + at.offset[2]});
     if (slot != kNoBlock && !visit(slot, at)) return;
   }
 }

@@ -18,42 +18,44 @@ namespace incremental_segmatch {
 
 /// When a tracked segment's state is worth a view.
 struct ViewParameters {
-  double growth_factor = 1.4;   ///< a new view once the segment has grown by this factor since its last view
-  double baseline_m = 10.0;     ///< or once it changed and the sensor is this far from where its last view was taken
+  double growth_factor = 1.4;  ///< a new view once the segment has grown by this factor since its last view
+  double baseline_m = 10.0;    ///< or once it changed and the sensor is this far from where its last view was taken
 };
 
+/// Of the robot side.
 struct FrontEndParameters {
-  GroundFilterParameters ground;
-  double local_radius_m = 50.0;        ///< of the local map around the sensor, horizontally
-  DynamicVoxelGridParameters grid;
-  SegmenterParameters segmenter;
-  DescriptorParameters descriptor;
-  ViewParameters view;
+  GroundFilterParameters ground;    ///< which points are obstacles
+  double local_radius_m = 50.0;     ///< of the local map around the sensor, horizontally
+  DynamicVoxelGridParameters grid;  ///< of the local map
+  SegmenterParameters segmenter;    ///< voxels to segments
+  DescriptorParameters descriptor;  ///< features of a segment
+  ViewParameters view;              ///< when a view is kept
 };
 
 /// The robot side's part of the funnel.
 struct FrontEndCounts {
   std::size_t points = 0;             ///< of the scan
   std::size_t obstacle_points = 0;    ///< that passed the ground filter
-  std::size_t dropped_nonfinite = 0;
+  std::size_t dropped_nonfinite = 0;  ///< points with NaN or infinity
   std::size_t dropped_outside = 0;    ///< outside the volume that the grid covers
   std::size_t voxels = 0;             ///< active in the local map
-  std::size_t activated_voxels = 0;
-  std::size_t moved_voxels = 0;
-  std::size_t removed_voxels = 0;
-  ClusterCounts clusters;
+  std::size_t activated_voxels = 0;   ///< that got enough points in this step
+  std::size_t moved_voxels = 0;       ///< whose centroid moved in this step
+  std::size_t removed_voxels = 0;     ///< that left the local map in this step
+  ClusterCounts clusters;             ///< what the voxels form
 };
 
+/// What came of one scan.
 struct FrontEndStep {
-  SegmentDelta delta;
-  FrontEndCounts counts;
-  StageTimes times;
+  SegmentDelta delta;     ///< what changed
+  FrontEndCounts counts;  ///< the funnel
+  StageTimes times;       ///< of this step
 };
 
 /// A point of the local map with the segment it belongs to (kNoSegment if none): for people to look at.
 struct LocalPoint {
-  Eigen::Vector3f position_odom;
-  SegmentId segment;
+  Eigen::Vector3f position_odom;  ///< in odom (m)
+  SegmentId segment;              ///< that it belongs to, or kNoSegment
 };
 
 /// One robot's local map. Synchronous; not thread-safe.
@@ -64,12 +66,12 @@ class FrontEnd {
   FrontEnd(const FrontEnd&) = delete;  // the segmenter refers to the grid
   FrontEnd& operator=(const FrontEnd&) = delete;
 
-  /// Takes one scan. Throws std::invalid_argument if its stamp is not after the last one's or its pose is not finite: nothing
-  /// has changed then.
+  /// Takes one scan. Throws std::invalid_argument if its stamp is not after the last one's or its pose is not finite:
+  /// nothing has changed then.
   FrontEndStep Process(const Scan& scan);
 
-  /// The odometry frame jumped (a correction by the SLAM stack): local cloud and segments move along, and tracking goes on. O(1)
-  /// for the cloud; the next delta reports every tracked segment as changed.
+  /// The odometry frame jumped (a correction by the SLAM stack): local cloud and segments move along, and tracking goes
+  /// on. O(1) for the cloud; the next delta reports every tracked segment as changed.
   void ApplyJump(const Pose& T_new_old);
 
   /// Every tracked segment, as a delta with full_state set, with the sequence number of the last delta.
@@ -78,9 +80,13 @@ class FrontEnd {
   /// The local map's points. O(local cloud).
   std::vector<LocalPoint> LocalCloud() const;
 
+  /// Name of the robot.
   const std::string& robot() const { return robot_; }
+  /// As given to the constructor.
   const FrontEndParameters& parameters() const { return parameters_; }
+  /// Which features the descriptors have.
   const Describer& describer() const { return describer_; }
+  /// Memory held, about. O(1).
   std::size_t memory_bytes() const;
 
  private:

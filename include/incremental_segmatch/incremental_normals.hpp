@@ -14,48 +14,53 @@
 
 namespace incremental_segmatch {
 
+/// Of the neighbourhoods.
 struct NormalsParameters {
-  double radius_m = 0.3;                ///< of a normal's neighbourhood; up to 8 voxels
-  double renewal_tolerance_voxels = 0.1;  ///< a voxel's contribution is renewed once its centroid moved farther than this
+  double radius_m = 0.3;  ///< of a normal's neighbourhood; up to 8 voxels
+  double renewal_tolerance_voxels =
+      0.1;  ///< a voxel's contribution is renewed once its centroid moved farther than this
 };
 
 /// The accumulators of a voxel: sums over the anchors p of its neighbourhood, itself included, in units of
 /// IncrementalNormals::unit_m() relative to the centre of the voxel's own cell. Integers: they never round.
 struct NormalAccumulators {
-  std::int64_t count = 0;                                        ///< n
-  Eigen::Matrix<std::int64_t, 3, 1> sum{0, 0, 0};                ///< b = sum of p
+  std::int64_t count = 0;                                                               ///< n
+  Eigen::Matrix<std::int64_t, 3, 1> sum{0, 0, 0};                                       ///< b = sum of p
   Eigen::Matrix<std::int64_t, 3, 3> outer = Eigen::Matrix<std::int64_t, 3, 3>::Zero();  ///< A = sum of p pT
 };
 
-/// A normal in the grid's frame, of either sign, and the curvature (2.2). NaN while the neighbourhood has fewer than 3 voxels.
+/// A normal in the grid's frame, of either sign, and the curvature (2.2). NaN while the neighbourhood has fewer than 3
+/// voxels.
 struct NormalEstimate {
-  Eigen::Vector3f normal_grid;
-  float curvature;
+  Eigen::Vector3f normal_grid;  ///< unit length, in the grid's frame
+  float curvature;              ///< smallest eigenvalue over their sum
 };
 
-/// Unit eigenvector of the smallest eigenvalue of a symmetric positive semidefinite matrix, that eigenvalue, and the trace. Where the
-/// two smallest eigenvalues are equal, any of the vectors that qualify.
+/// Unit eigenvector of the smallest eigenvalue of a symmetric positive semidefinite matrix, that eigenvalue, and the
+/// trace. Where the two smallest eigenvalues are equal, any of the vectors that qualify.
 struct SmallestEigen {
-  Eigen::Vector3d vector;
-  double value;
-  double trace;
+  Eigen::Vector3d vector;  ///< unit length
+  double value;            ///< the smallest eigenvalue
+  double trace;            ///< sum of the eigenvalues
 };
+/// The smallest eigenvalue of a symmetric positive semidefinite matrix. O(1).
 SmallestEigen SmallestEigenOf(const Eigen::Matrix3d& matrix);
 
 /// Keeps the accumulators A, b, n of (3.6) for every active voxel of a grid, by scattering and gathering (3.9, 3.10).
 ///
-/// Each voxel has an anchor: its centroid when it last gave its contribution. Two voxels are neighbours iff their anchors lie within
-/// the radius. A voxel that is removed, or whose centroid has moved beyond the tolerance, takes back exactly what it gave, from
-/// exactly those that got it. Anchors are rounded to unit_m() (a 512th of a voxel for radii of up to 3.5 voxels) relative to their own cell, so that all sums are
-/// integers: accumulators equal the batch sums over the anchors bit for bit after any sequence of calls, in any order, anywhere in
-/// the world.
+/// Each voxel has an anchor: its centroid when it last gave its contribution. Two voxels are neighbours iff their
+/// anchors lie within the radius. A voxel that is removed, or whose centroid has moved beyond the tolerance, takes back
+/// exactly what it gave, from exactly those that got it. Anchors are rounded to unit_m() (a 512th of a voxel for radii
+/// of up to 3.5 voxels) relative to their own cell, so that all sums are integers: accumulators equal the batch sums
+/// over the anchors bit for bit after any sequence of calls, in any order, anywhere in the world.
 ///
 /// Normals are computed when they are read, and kept until an accumulator changes. All is in the grid's frame: after
-/// DynamicVoxelGrid::Transform the accumulators of (3.12), A <- R A RT + R b tT + t bT RT + n t tT and b <- n t + R b, and N <- R N are
-/// what one gets by expressing them in the new frame, and nothing need be done; NormalOdom rotates when it is read.
+/// DynamicVoxelGrid::Transform the accumulators of (3.12), A <- R A RT + R b tT + t bT RT + n t tT and b <- n t + R b,
+/// and N <- R N are what one gets by expressing them in the new frame, and nothing need be done; NormalOdom rotates
+/// when it is read.
 ///
-/// Cost: Insert O((activated + renewed) * neighbours + moved), Remove O(removed * neighbours). Not thread-safe, not even for
-/// reading. The grid must outlive this object.
+/// Cost: Insert O((activated + renewed) * neighbours + moved), Remove O(removed * neighbours). Not thread-safe, not
+/// even for reading. The grid must outlive this object.
 class IncrementalNormals {
  public:
   /// Throws std::invalid_argument naming the parameter that is out of range.
@@ -73,19 +78,25 @@ class IncrementalNormals {
   /// The same normal in the odometry frame, turned towards the viewpoint. NaN while it is undefined.
   Eigen::Vector3d NormalOdom(VoxelHandle voxel, const Eigen::Vector3d& viewpoint_odom) const;
 
-  /// Root mean square distance in metres of the neighbourhood from its plane (Rabbani's residual). NaN with fewer than 3 voxels.
+  /// Root mean square distance in metres of the neighbourhood from its plane (Rabbani's residual). NaN with fewer than
+  /// 3 voxels.
   double PlaneResidual(VoxelHandle voxel) const;
 
+  /// Accumulators of an active voxel. O(1).
   NormalAccumulators Accumulators(VoxelHandle voxel) const;
   /// Position of an active voxel's anchor relative to the centre of its cell, in units of unit_m(): integers.
   Eigen::Vector3i Anchor(VoxelHandle voxel) const;
 
+  /// Unit of the accumulators (m).
   double unit_m() const { return unit_m_; }
+  /// As given to the constructor.
   const NormalsParameters& parameters() const { return parameters_; }
+  /// Memory held, about. O(1).
   std::size_t memory_bytes() const { return blocks_.memory_bytes() + masks_.capacity() * sizeof(Masks); }
 
  private:
-  // (x, y, z, 1) in units, integers throughout. Anchors are relative to their block's corner, accumulators to their cell's centre.
+  // (x, y, z, 1) in units, integers throughout. Anchors are relative to their block's corner, accumulators to their
+  // cell's centre.
   using Position = Eigen::Array4f;
   struct Moments {
     Eigen::Array4i squares;   // sums of x x, y y, z z, 1

@@ -11,6 +11,7 @@
 
 namespace incremental_segmatch {
 
+/// Of the search.
 struct MaxCliqueParameters {
   std::size_t min_size = 6;                    ///< T: smaller cliques are no answer; >= 3
   std::chrono::microseconds deadline{100000};  ///< then the incumbent is returned, unproven; > 0
@@ -21,6 +22,7 @@ struct MaxCliqueParameters {
   std::uint64_t max_tie_work = 4000000;
 };
 
+/// What the search found.
 struct MaxCliqueResult {
   std::vector<std::uint32_t> vertices;  ///< sorted; empty if no clique of min_size was found
   std::size_t upper_bound = 0;          ///< no clique is larger than this (min_size - 1 where there is proof of none)

@@ -14,8 +14,9 @@
 
 namespace incremental_segmatch {
 
-/// Elements stay where they are for the array's life. Memory is asked for in 2 MB pages: elements that are visited in no order miss
-/// the caches of address translation otherwise. O(1) access; growing is O(new elements). For large, trivially destructible types.
+/// Elements stay where they are for the array's life. Memory is asked for in 2 MB pages: elements that are visited in
+/// no order miss the caches of address translation otherwise. O(1) access; growing is O(new elements). For large,
+/// trivially destructible types.
 template <class T>
 class PagedArray {
   static_assert(std::is_trivially_destructible_v<T>, "elements are not destroyed one by one");
@@ -29,7 +30,7 @@ class PagedArray {
   /// Makes room for at least this many elements; new ones are value-initialized.
   void Grow(std::size_t size) {
     while (this->size() < size) {
-      void* memory = ::operator new(kPageBytes, std::align_val_t{kHugePage});
+      void* memory = ::operator new (kPageBytes, std::align_val_t{kHugePage});
 #if defined(__linux__)
       madvise(memory, kPageBytes, MADV_HUGEPAGE);  // advice: works without
 #endif
@@ -43,7 +44,7 @@ class PagedArray {
   static constexpr std::size_t kPerPage = 1024;
   static constexpr std::size_t kPageBytes = (kPerPage * sizeof(T) + kHugePage - 1) / kHugePage * kHugePage;
   struct Free {
-    void operator()(T* memory) const { ::operator delete(memory, std::align_val_t{kHugePage}); }
+    void operator()(T* memory) const { ::operator delete (memory, std::align_val_t{kHugePage}); }
   };
   std::vector<std::unique_ptr<T, Free>> pages_;
 };

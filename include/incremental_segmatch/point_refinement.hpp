@@ -10,33 +10,37 @@
 
 namespace incremental_segmatch {
 
+/// Of the refinement.
 struct RefinementParameters {
-  bool enabled = true;
-  double max_distance_m = 1.0;       ///< of a point to its partner, in the first iteration
-  double min_distance_m = 0.3;       ///< in the last one; also the spacing of the points that the first iterations take
-  int max_iterations = 20;
-  double min_overlap = 0.3;          ///< share of the local points with a partner in the last iteration; less refuses the recognition
-  double normal_radius_m = 0.4;      ///< of the neighbourhood that tells which way a target point's surface faces
-  std::size_t max_points = 3000;     ///< local points that are used, spread evenly over the list
-  double min_stiffness = 0.005;      ///< information of a direction over that of the best one, below which the points leave it open
-  int max_open_directions = 1;       ///< of six; more refuses the recognition; walls and poles alone leave the height open
+  bool enabled = true;          ///< false: the transform over centroids stays
+  double max_distance_m = 1.0;  ///< of a point to its partner, in the first iteration
+  double min_distance_m = 0.3;  ///< in the last one; also the spacing of the points that the first iterations take
+  int max_iterations = 20;      ///< of nearest neighbours and least squares
+  double min_overlap =
+      0.3;  ///< share of the local points with a partner in the last iteration; less refuses the recognition
+  double normal_radius_m = 0.4;   ///< of the neighbourhood that tells which way a target point's surface faces
+  std::size_t max_points = 3000;  ///< local points that are used, spread evenly over the list
+  double min_stiffness =
+      0.005;  ///< information of a direction over that of the best one, below which the points leave it open
+  int max_open_directions = 1;  ///< of six; more refuses the recognition; walls and poles alone leave the height open
 };
 
+/// A refined transform with its evidence.
 struct RefinedTransform {
-  Pose T_target_local = Pose::Identity();
-  double overlap = 0.0;              ///< share of the local points with a partner
-  double rms_m = 0.0;                ///< point-to-plane residual
-  int open_directions = 0;           ///< directions of six in which the points say nothing and the given pose stays
-  /// From the information of the point pairs (points of one cell of min_distance_m count as one), ROS's order, perturbation on
-  /// the left: T_true = exp(xi) T in the axes and about the origin of the target's frame. Open directions have a standard
-  /// deviation of max_distance_m / 2 at the points.
+  Pose T_target_local = Pose::Identity();  ///< p_map = T * p_odom
+  double overlap = 0.0;                    ///< share of the local points with a partner
+  double rms_m = 0.0;                      ///< point-to-plane residual
+  int open_directions = 0;  ///< directions of six in which the points say nothing and the given pose stays
+  /// From the information of the point pairs (points of one cell of min_distance_m count as one), ROS's order,
+  /// perturbation on the left: T_true = exp(xi) T in the axes and about the origin of the target's frame. Open
+  /// directions have a standard deviation of max_distance_m / 2 at the points.
   Covariance6 covariance = Covariance6::Identity();
 };
 
 /// Iterative closest points over two clouds in their own frames (metres, relative to any origin): robustly weighted
-/// Gauss-Newton on distances across what is thin about a target point (a surface, a pole), or to the point itself where nothing
-/// is. Nothing if the clouds overlap too little or leave more directions of the pose open than allowed. Deterministic; points
-/// that are not finite are ignored. O(points + max_points * iterations).
+/// Gauss-Newton on distances across what is thin about a target point (a surface, a pole), or to the point itself where
+/// nothing is. Nothing if the clouds overlap too little or leave more directions of the pose open than allowed.
+/// Deterministic; points that are not finite are ignored. O(points + max_points * iterations).
 ///
 /// Throws std::invalid_argument naming the parameter that is out of range.
 std::optional<RefinedTransform> RefineOnPoints(const std::vector<Eigen::Vector3d>& points_local,

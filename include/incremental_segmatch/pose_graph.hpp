@@ -24,29 +24,29 @@ struct PoseGraphParameters {
 
 /// A pose of the graph.
 struct PoseGraphNode {
-  RobotIndex robot = 0;
-  StampNs stamp_ns = 0;
+  RobotIndex robot = 0;                   ///< whose pose it is
+  StampNs stamp_ns = 0;                   ///< of the pose
   Pose T_odom_sensor = Pose::Identity();  ///< as added
   Pose T_map_sensor = Pose::Identity();   ///< as estimated
 };
 
 /// A measurement between two nodes, named by their positions in PoseGraph::Nodes().
 struct PoseGraphEdge {
-  std::size_t from = 0;
-  std::size_t to = 0;
-  Pose T_from_to = Pose::Identity();
+  std::size_t from = 0;                              ///< node; of a closure, the target
+  std::size_t to = 0;                                ///< node; of a closure, the query
+  Pose T_from_to = Pose::Identity();                 ///< as measured
   Covariance6 covariance = Covariance6::Identity();  ///< T_from_to * exp(xi), order x, y, z, rx, ry, rz
-  bool is_closure = false;
+  bool is_closure = false;                           ///< false: odometry
 };
 
 /// What an optimization did.
 struct PoseGraphReport {
-  std::size_t nodes = 0;
-  std::size_t closures = 0;
+  std::size_t nodes = 0;              ///< poses of all robots
+  std::size_t closures = 0;           ///< in the graph
   std::size_t outvoted_closures = 0;  ///< closures that end more than three sigmas away and so weigh next to nothing
   int iterations = 0;                 ///< of all solver runs together
-  double initial_cost = 0.0;
-  double final_cost = 0.0;
+  double initial_cost = 0.0;          ///< before, half the sum of squared and robustified residuals in sigmas
+  double final_cost = 0.0;            ///< after
   bool converged = true;  ///< false if the last solver run stopped at its iteration limit; the result is usable
 };
 
@@ -61,7 +61,9 @@ class PoseGraph {
   /// Throws std::invalid_argument naming a parameter that is not positive.
   explicit PoseGraph(const PoseGraphParameters& parameters);
   ~PoseGraph();
+  /// Moves; what was moved from can only be assigned to or destroyed.
   PoseGraph(PoseGraph&&) noexcept;
+  /// Moves likewise.
   PoseGraph& operator=(PoseGraph&&) noexcept;
 
   /// Appends a pose of a robot's odometry; stamps of a robot increase. A new robot's map is its odometry frame until a

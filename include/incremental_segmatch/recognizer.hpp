@@ -11,20 +11,22 @@
 
 namespace incremental_segmatch {
 
+/// When a set of correspondences is a place.
 struct RecognizerParameters {
   ConsistencyParameters consistency;  ///< its max_vertical_slope must be at least max_tilt_rad
-  MaxCliqueParameters clique;
-  double max_tilt_rad = 0.1;   ///< between the two gravity-aligned maps; refuses mirrored fits; 0 to pi
-  double max_rms_m = 0.4;      ///< residual of the fit over all inliers, > 0
-  double min_spread_m = 1.0;   ///< second largest standard deviation of the inlier centroids; refuses lines; > 0
-  double min_sigma_m = 0.05;   ///< floor of a centroid's standard deviation per axis in the covariance, > 0
-  bool find_runner_up = true;  ///< also look for the best clique beside the winner: evidence against ambiguity
+  MaxCliqueParameters clique;         ///< of the search for the largest consistent set
+  double max_tilt_rad = 0.1;          ///< between the two gravity-aligned maps; refuses mirrored fits; 0 to pi
+  double max_rms_m = 0.4;             ///< residual of the fit over all inliers, > 0
+  double min_spread_m = 1.0;          ///< second largest standard deviation of the inlier centroids; refuses lines; > 0
+  double min_sigma_m = 0.05;          ///< floor of a centroid's standard deviation per axis in the covariance, > 0
+  bool find_runner_up = true;         ///< also look for the best clique beside the winner: evidence against ambiguity
   std::chrono::microseconds runner_up_deadline{20000};  ///< of that search, > 0
 };
 
 /// Why there was no recognition, or that there was one.
 enum class RecognitionOutcome { kAccepted, kTooFewCandidates, kCliqueTooSmall, kDegenerate, kTilted, kLargeResidual };
 
+/// A place that was recognised, by the centroids of its segments.
 struct Recognition {
   Pose T_target_local = Pose::Identity();  ///< p_map = T * p_odom, least squares over all inliers (Umeyama, no scale)
   /// Of T_target_local in ROS's order (x, y, z, rotation about x, y, z, metres and radians), perturbation on the left:
@@ -41,16 +43,17 @@ struct Recognition {
   std::size_t runner_up_size = 0;
 };
 
+/// A recognition, or the stage that ended it, with counts and times.
 struct RecognizerResult {
-  std::optional<Recognition> recognition;
-  RecognitionOutcome outcome = RecognitionOutcome::kTooFewCandidates;
-  std::size_t candidates = 0;
-  std::size_t edges = 0;
-  std::uint64_t tested_pairs = 0;
+  std::optional<Recognition> recognition;                              ///< where the outcome is kAccepted
+  RecognitionOutcome outcome = RecognitionOutcome::kTooFewCandidates;  ///< how it ended
+  std::size_t candidates = 0;                                          ///< correspondences given
+  std::size_t edges = 0;                                               ///< consistent pairs
+  std::uint64_t tested_pairs = 0;                                      ///< pairs tested for consistency
   std::size_t clique_size = 0;  ///< of the best clique found, 0 below the smallest acceptable size
-  double graph_ms = 0.0;
-  double clique_ms = 0.0;  ///< including the search for the runner-up
-  double transform_ms = 0.0;
+  double graph_ms = 0.0;        ///< time for the consistency graph
+  double clique_ms = 0.0;       ///< including the search for the runner-up
+  double transform_ms = 0.0;    ///< time for the transform and its tests
 };
 
 /// Covariance of the least-squares transform of points to `points_target` (the transformed points, target frame) with
@@ -68,6 +71,7 @@ class Recognizer {
  public:
   /// Throws std::invalid_argument naming the parameter that is out of range.
   explicit Recognizer(const RecognizerParameters& parameters);
+  /// The best supported transform. Independent of the order of the correspondences.
   RecognizerResult Recognize(const Correspondences& correspondences);
 
  private:

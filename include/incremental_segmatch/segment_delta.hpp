@@ -14,24 +14,26 @@ namespace incremental_segmatch {
 
 /// A segment as it is now.
 struct SegmentState {
-  SegmentId id = kNoSegment;
-  std::uint32_t size = 0;                                        ///< voxels, those that left the local map included
-  Eigen::Vector3d centroid_odom = Eigen::Vector3d::Zero();
-  Descriptor descriptor;
-  bool new_view = false;                                         ///< worth keeping as a view: it grew, or is seen from elsewhere
-  std::shared_ptr<const Points> points_centroid;                 ///< with new_view: relative to centroid_odom, odom's axes; may be null
+  SegmentId id = kNoSegment;                                ///< unique per robot, never reused
+  std::uint32_t size = 0;                                   ///< voxels, those that left the local map included
+  Eigen::Vector3d centroid_odom = Eigen::Vector3d::Zero();  ///< mean of its voxels' centroids (m)
+  Descriptor descriptor;                                    ///< unscaled
+  bool new_view = false;  ///< worth keeping as a view: it grew, or is seen from elsewhere
+  std::shared_ptr<const Points>
+      points_centroid;  ///< with new_view: relative to centroid_odom, odom's axes; may be null
 };
 
-/// One step of one robot. Deltas of a robot have consecutive sequence numbers; a full state replaces all that was said before.
+/// One step of one robot. Deltas of a robot have consecutive sequence numbers; a full state replaces all that was said
+/// before.
 struct SegmentDelta {
-  std::string robot;
-  std::uint64_t sequence = 0;
-  StampNs stamp_ns = 0;
-  Pose T_odom_sensor = Pose::Identity();
-  bool full_state = false;
-  std::vector<SegmentState> changed;                             ///< ascending IDs
-  std::vector<RenamedSegment> renamed;
-  std::vector<RetiredSegment> retired;
+  std::string robot;                      ///< name of the robot
+  std::uint64_t sequence = 0;             ///< consecutive
+  StampNs stamp_ns = 0;                   ///< of the scan
+  Pose T_odom_sensor = Pose::Identity();  ///< where the sensor was
+  bool full_state = false;                ///< `changed` holds every tracked segment, and replaces all said before
+  std::vector<SegmentState> changed;      ///< ascending IDs
+  std::vector<RenamedSegment> renamed;    ///< merged segments
+  std::vector<RetiredSegment> retired;    ///< segments that ended
 };
 
 }  // namespace incremental_segmatch

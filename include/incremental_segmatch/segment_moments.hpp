@@ -9,10 +9,11 @@
 
 namespace incremental_segmatch {
 
-/// Count, sum and sum of outer products of points relative to a reference near them, so that doubles never cancel; and the
-/// range of heights that the points ever had. All in the grid's frame. Add, Subtract and Merge are O(1).
+/// Count, sum and sum of outer products of points relative to a reference near them, so that doubles never cancel; and
+/// the range of heights that the points ever had. All in the grid's frame. Add, Subtract and Merge are O(1).
 class SegmentMoments {
  public:
+  /// Adds a point. O(1).
   void Add(const Eigen::Vector3d& point) {
     if (count_ == 0) {
       *this = SegmentMoments();
@@ -24,12 +25,14 @@ class SegmentMoments {
     AddOuter(p, 1.0);
     Extend(point.z());
   }
+  /// Takes a point out that was added. O(1).
   void Subtract(const Eigen::Vector3d& point) {
     const Eigen::Vector3d p = point - reference_;
     --count_;
     sum_ -= p;
     AddOuter(p, -1.0);
   }
+  /// Replaces a point. O(1).
   void Move(const Eigen::Vector3d& before, const Eigen::Vector3d& after) {
     const Eigen::Vector3d a = before - reference_;
     const Eigen::Vector3d b = after - reference_;
@@ -57,6 +60,7 @@ class SegmentMoments {
     max_z_ = std::max(max_z_, other.max_z_);
   }
 
+  /// Number of points.
   std::size_t count() const { return count_; }
   /// Requires count() > 0.
   Eigen::Vector3d Centroid() const { return reference_ + sum_ / static_cast<double>(count_); }
@@ -70,7 +74,9 @@ class SegmentMoments {
         covariance(row, col) = covariance(col, row) = outer_[k] / n - mean[row] * mean[col];
     return covariance;
   }
+  /// Lowest height of any point ever added (m).
   double min_z() const { return min_z_; }
+  /// Greatest height of any point ever added (m).
   double max_z() const { return max_z_; }
 
  private:

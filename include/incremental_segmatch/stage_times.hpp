@@ -21,6 +21,7 @@ class StageTimer {
     times_.emplace_back(stage, std::chrono::duration<double, std::milli>(now - start_).count());
     start_ = now;
   }
+  /// All laps so far; the timer is empty then.
   StageTimes Take() { return std::move(times_); }
 
  private:

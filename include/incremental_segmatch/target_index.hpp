@@ -15,38 +15,43 @@ namespace incremental_segmatch {
 
 /// A view that is, or was, open to matching.
 struct IndexedView {
-  SegmentKey segment;
-  std::uint32_t view = 0;  ///< index among the segment's views
-  Descriptor descriptor;
-  Eigen::Vector3d centroid_map = Eigen::Vector3d::Zero();
-  bool live = false;       ///< false once its segment was removed
-  bool released = false;   ///< open to its own robot as well, not only to others
+  SegmentKey segment;                                      ///< whose view it is
+  std::uint32_t view = 0;                                  ///< index among the segment's views
+  Descriptor descriptor;                                   ///< unscaled
+  Eigen::Vector3d centroid_map = Eigen::Vector3d::Zero();  ///< in the map (m), at the time of insertion
+  bool live = false;                                       ///< false once its segment was removed
+  bool released = false;                                   ///< open to its own robot as well, not only to others
 };
 
 /// A target segment that looks like a local one, by its most alike view.
 struct TargetCandidate {
   std::uint64_t item = 0;  ///< names the view in the index
-  SegmentKey segment;
+  SegmentKey segment;      ///< the target segment
   float distance = 0.f;    ///< scaled descriptor distance
 };
 
-/// Nearest target segments by descriptor. Dimensions are scaled by their standard deviation over the indexed views, taken anew
-/// each time that their number has doubled. Not thread-safe.
+/// Nearest target segments by descriptor. Dimensions are scaled by their standard deviation over the indexed views,
+/// taken anew each time that their number has doubled. Not thread-safe.
 class TargetIndex {
  public:
-  /// Opens all views of a segment of the map to matching: by other robots, and, if released, by its own. A segment that is open
-  /// already is replaced. Throws std::invalid_argument if its descriptors differ in size from those that are there.
+  /// Opens all views of a segment of the map to matching: by other robots, and, if released, by its own. A segment that
+  /// is open already is replaced. Throws std::invalid_argument if its descriptors differ in size from those that are
+  /// there.
   void Add(const SegmentKey& segment, const TargetMap& map, bool released);
   /// Closes a segment; nothing happens if it isn't open.
   void Remove(const SegmentKey& segment);
   /// Takes centroids from the map anew, after a correction. O(views).
   void RefreshCentroids(const TargetMap& map);
 
+  /// True if views of the segment are in the index.
   bool Contains(const SegmentKey& segment) const { return items_.count(segment) != 0; }
+  /// Segments with views in the index.
   std::size_t segments() const { return items_.size(); }
 
-  /// The `count` nearest segments (0: all) within `max_distance` that are open to this robot, by ascending (distance, segment).
-  std::vector<TargetCandidate> Nearest(const Descriptor& query, RobotIndex robot, std::size_t count, float max_distance) const;
+  /// The `count` nearest segments (0: all) within `max_distance` that are open to this robot, by ascending (distance,
+  /// segment).
+  std::vector<TargetCandidate> Nearest(const Descriptor& query, RobotIndex robot, std::size_t count,
+                                       float max_distance) const;
   /// True if the item still stands for a view that is open to this robot.
   bool IsOpen(std::uint64_t item, RobotIndex robot) const {
     return views_[item].live && (views_[item].released || views_[item].segment.robot != robot);
@@ -54,6 +59,7 @@ class TargetIndex {
   /// Scaled distance of two descriptors.
   float Distance(const Descriptor& a, const Descriptor& b) const { return (a - b).cwiseProduct(weights_).norm(); }
 
+  /// A view by its item. O(1).
   const IndexedView& view(std::uint64_t item) const { return views_[item]; }
   /// Items are numbered as they come: those from here on are newer than now.
   std::uint64_t next_item() const { return views_.size(); }

@@ -17,33 +17,35 @@ namespace incremental_segmatch {
 
 /// A trajectory pose: where odometry had the sensor, and where it is in the map after corrections.
 struct TrajectoryPose {
-  StampNs stamp_ns = 0;
-  Pose T_odom_sensor = Pose::Identity();
-  Pose T_map_sensor = Pose::Identity();
+  StampNs stamp_ns = 0;                   ///< of the scan
+  Pose T_odom_sensor = Pose::Identity();  ///< as odometry had it
+  Pose T_map_sensor = Pose::Identity();   ///< as corrected
 };
 
 /// One look at a segment.
 struct SegmentView {
-  RobotIndex robot = 0;             ///< on whose trajectory it hangs
-  std::uint32_t pose = 0;           ///< index of the trajectory pose that it was seen from
-  std::uint32_t size = 0;           ///< voxels
+  RobotIndex robot = 0;                                       ///< on whose trajectory it hangs
+  std::uint32_t pose = 0;                                     ///< index of the trajectory pose that it was seen from
+  std::uint32_t size = 0;                                     ///< voxels
   Eigen::Vector3d centroid_sensor = Eigen::Vector3d::Zero();  ///< in the frame of that pose
-  Descriptor descriptor;
+  Descriptor descriptor;                                      ///< unscaled
   std::shared_ptr<const Points> points_centroid;  ///< relative to the centroid, axes of that robot's odom; may be null
 };
 
+/// A segment of the map, with the views that are kept of it.
 struct TargetSegment {
-  std::vector<SegmentView> views;   ///< oldest first; never empty
-  StampNs last_seen_ns = 0;
-  bool tracked = false;             ///< by its robot's local map, now
+  std::vector<SegmentView> views;  ///< oldest first; never empty
+  StampNs last_seen_ns = 0;        ///< stamp of the last scan that changed it
+  bool tracked = false;            ///< by its robot's local map, now
 };
 
+/// What is kept.
 struct TargetMapParameters {
-  std::size_t max_views = 4;        ///< kept of a segment: the newest, and the largest of the others
+  std::size_t max_views = 4;  ///< kept of a segment: the newest, and the largest of the others
 };
 
-/// Holds segments and trajectories; knows nothing of matching. Not thread-safe. A robot index that RobotByName never gave throws
-/// std::out_of_range.
+/// Holds segments and trajectories; knows nothing of matching. Not thread-safe. A robot index that RobotByName never
+/// gave throws std::out_of_range.
 class TargetMap {
  public:
   /// Throws std::invalid_argument naming the parameter that is out of range.
@@ -51,30 +53,37 @@ class TargetMap {
 
   /// Index of a robot, given at the first call with its name.
   RobotIndex RobotByName(const std::string& name);
+  /// Name of a robot. Throws std::out_of_range for one that is not in the map.
   const std::string& RobotName(RobotIndex robot) const { return robots_.at(robot).name; }
+  /// Number of robots.
   std::size_t robots() const { return robots_.size(); }
 
   /// Appends a pose to a robot's trajectory and returns its index. It follows the last correction rigidly. Throws
   /// std::invalid_argument if the stamp is not after the last one's or the pose is not finite.
   std::uint32_t AddPose(RobotIndex robot, StampNs stamp_ns, const Pose& T_odom_sensor);
+  /// Trajectory of a robot, stamps ascending.
   const std::vector<TrajectoryPose>& Trajectory(RobotIndex robot) const { return robots_.at(robot).trajectory; }
   /// T_map_odom of a robot now.
   const Pose& T_map_odom(RobotIndex robot) const { return robots_.at(robot).T_map_odom; }
-  /// A corrected trajectory, in any order: poses at corrected stamps are taken as they are; the others follow the nearest earlier
-  /// corrected pose rigidly, those before the first the first. A corrected pose between two stamps of the trajectory counts
-  /// from where odometry, interpolated, had the sensor then; one before or after the trajectory is ignored. T_map_odom is then
-  /// that of the newest corrected pose. Throws std::invalid_argument if a pose is not finite: nothing has changed then.
-  /// O((trajectory + corrections) log).
+  /// A corrected trajectory, in any order: poses at corrected stamps are taken as they are; the others follow the
+  /// nearest earlier corrected pose rigidly, those before the first the first. A corrected pose between two stamps of
+  /// the trajectory counts from where odometry, interpolated, had the sensor then; one before or after the trajectory
+  /// is ignored. T_map_odom is then that of the newest corrected pose. Throws std::invalid_argument if a pose is not
+  /// finite: nothing has changed then. O((trajectory + corrections) log).
   void CorrectTrajectory(RobotIndex robot, const std::vector<StampedPose>& T_map_sensor);
 
-  /// Sets the newest state of a segment, which is tracked from now on: `view` replaces the last view of its robot unless
-  /// `keep_last`. Throws std::invalid_argument if the view's pose does not exist.
+  /// Sets the newest state of a segment, which is tracked from now on: `view` replaces the last view of its robot
+  /// unless `keep_last`. Throws std::invalid_argument if the view's pose does not exist.
   void UpdateSegment(const SegmentKey& key, SegmentView view, bool keep_last, StampNs stamp_ns);
-  /// Moves the views of `from` to `to`, which is made if there is none; `from` is gone. Views stay ordered by their pose's stamp;
-  /// `to` is tracked if either was, and last seen when the later of both was. Nothing happens if there is no `from`.
+  /// Moves the views of `from` to `to`, which is made if there is none; `from` is gone. Views stay ordered by their
+  /// pose's stamp; `to` is tracked if either was, and last seen when the later of both was. Nothing happens if there is
+  /// no `from`.
   void MoveViews(const SegmentKey& from, const SegmentKey& to);
+  /// Takes a segment out, if it is in.
   void Erase(const SegmentKey& key) { segments_.erase(key); }
+  /// The segment, or null. Valid until the map is changed.
   TargetSegment* Find(const SegmentKey& key);
+  /// The same.
   const TargetSegment* Find(const SegmentKey& key) const;
 
   /// Ordered by key.
@@ -83,14 +92,18 @@ class TargetMap {
   /// Centroid of a view in the map, after all corrections.
   Eigen::Vector3d CentroidMap(const SegmentView& view) const;
   /// Pose in the map that a view was seen from.
-  const TrajectoryPose& PoseOf(const SegmentView& view) const { return robots_.at(view.robot).trajectory.at(view.pose); }
+  const TrajectoryPose& PoseOf(const SegmentView& view) const {
+    return robots_.at(view.robot).trajectory.at(view.pose);
+  }
 
+  /// Memory held, about. O(map).
   std::size_t memory_bytes() const;
 
   /// Writes the map; a crash while writing leaves the previous file whole. Throws std::runtime_error naming the file.
   void Save(const std::string& path) const;
-  /// Reads a map; no segment of it is tracked. Of a segment with more views than `parameters` allow the same ones stay as ever.
-  /// Throws std::runtime_error naming the file and what is wrong with it: damaged, truncated, of another kind or of a newer version.
+  /// Reads a map; no segment of it is tracked. Of a segment with more views than `parameters` allow the same ones stay
+  /// as ever. Throws std::runtime_error naming the file and what is wrong with it: damaged, truncated, of another kind
+  /// or of a newer version.
   static TargetMap Load(const std::string& path, const TargetMapParameters& parameters);
 
  private:
