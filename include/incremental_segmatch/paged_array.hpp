@@ -22,9 +22,13 @@ class PagedArray {
   static_assert(std::is_trivially_destructible_v<T>, "elements are not destroyed one by one");
 
  public:
+  /// Number of elements, always whole pages.
   std::size_t size() const { return pages_.size() * kPerPage; }
+  /// Memory held.
   std::size_t memory_bytes() const { return pages_.size() * kPageBytes; }
+  /// Element i < size().
   T& operator[](std::size_t i) { return pages_[i / kPerPage].get()[i % kPerPage]; }
+  /// Element i < size().
   const T& operator[](std::size_t i) const { return pages_[i / kPerPage].get()[i % kPerPage]; }
 
   /// Makes room for at least this many elements; new ones are value-initialized.
