@@ -1,6 +1,7 @@
 #include "incremental_segmatch/incremental_segmenter.hpp"
 
 #include <algorithm>
+#include <limits>
 #include <stdexcept>
 #include <string>
 
@@ -23,6 +24,7 @@ IncrementalSegmenter<Policy>::IncrementalSegmenter(const SegmenterParameters& pa
 template <class Policy>
 SegmentUpdate IncrementalSegmenter<Policy>::Remove(const std::vector<RemovedVoxel>& removed) {
   for (const RemovedVoxel& gone : removed) {
+    BlockOf(gone.voxel).pending &= ~CellBit(gone.voxel);
     if (!IsClustered(gone.voxel)) continue;
     VoxelNode& node = voxels_[gone.voxel];
     Cluster& cluster = ClusterAt(FindRoot(node.label));
@@ -62,6 +64,12 @@ SegmentUpdate IncrementalSegmenter<Policy>::Insert(const VoxelUpdate& update) {
   policy_.PrepareSeeds(&seeds_);
   for (const VoxelHandle seed : seeds_)
     if (!IsClustered(seed)) GrowFromSeed(seed);
+  if constexpr (!Policy::kAcceptsAll) {
+    rough_.insert(rough_.end(), update.activated.begin(), update.activated.end());
+    for (const VoxelHandle voxel : rough_)
+      if (!IsClustered(voxel)) JoinFlattestCluster(voxel);
+    rough_.clear();
+  }
   return Settle();
 }
 
@@ -122,7 +130,12 @@ template <class Policy>
 typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::VisitNeighbours(VoxelHandle from, Label root) {
   grid_->ForEachNeighbour(stencil_, from, [&](VoxelHandle to, const Eigen::Vector3f&) {
     const Label label = voxels_[to].label;
-    if (label == kQueued || !policy_.CanPointBeSeed(to) || !policy_.CanGrowToPoint(from, to)) return true;
+    if (label == kQueued) return true;
+    if (!policy_.CanPointBeSeed(to)) {
+      if (label == kNoLabel) rough_.push_back(to);  // looked at once all regions have grown
+      return true;
+    }
+    if (!policy_.CanGrowToPoint(from, to)) return true;
     if (label == kNoLabel) {
       Queue(to);
     } else if (label != root) {
@@ -131,6 +144,21 @@ typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::Visit
     return true;
   });
   return root;
+}
+
+/// A point that may not seed: it joins a cluster, but neither links two nor lets others follow, so that the order of such points
+/// does not matter.
+template <class Policy>
+void IncrementalSegmenter<Policy>::JoinFlattestCluster(VoxelHandle voxel) {
+  std::pair<float, VoxelHandle> flattest{std::numeric_limits<float>::infinity(), kEnd};
+  grid_->ForEachNeighbour(stencil_, voxel, [&](VoxelHandle from, const Eigen::Vector3f&) {
+    if (IsClustered(from) && policy_.CanPointBeSeed(from) && policy_.CanGrowToPoint(from, voxel))
+      flattest = std::min(flattest, std::make_pair(policy_.Roughness(from), from));
+    return true;
+  });
+  if (flattest.second == kEnd) return;
+  BlockOf(voxel).pending &= ~CellBit(voxel);
+  AddVoxel(FindRoot(voxels_[flattest.second].label), voxel);
 }
 
 /// The same where every neighbour counts: of a block whose voxels are all of one cluster, one within the radius decides, and
@@ -443,9 +471,10 @@ std::size_t IncrementalSegmenter<Policy>::memory_bytes() const {
   return nodes_.capacity() * sizeof(Node) + free_nodes_.capacity() * sizeof(Label) + clusters_.capacity() * sizeof(Cluster) +
          free_clusters_.capacity() * sizeof(ClusterIndex) + voxels_.capacity() * sizeof(VoxelNode) +
          blocks_.capacity() * sizeof(BlockNode) +
-         (seeds_.capacity() + queue_.capacity() + region_.capacity()) * sizeof(VoxelHandle);
+         (seeds_.capacity() + queue_.capacity() + region_.capacity() + rough_.capacity()) * sizeof(VoxelHandle);
 }
 
 template class IncrementalSegmenter<EuclideanPolicy>;
+template class IncrementalSegmenter<SmoothnessPolicy>;
 
 }  // namespace incremental_segmatch

@@ -20,11 +20,12 @@ enum class BoundaryPolicy {
   kKeep         ///< it stays a segment until it has left entirely; its sums keep the points that left
 };
 
+/// Which clusters are segments.
 struct SegmenterParameters {
-  double growing_radius_m = 0.2;
-  std::size_t min_cluster_size = 100;    ///< voxels; smaller clusters are no segments
-  std::size_t max_cluster_size = 15000;  ///< voxels; larger clusters are no segments
-  BoundaryPolicy boundary = BoundaryPolicy::kKeep;
+  double growing_radius_m = 0.2;                    ///< voxels whose centroids are this near belong together
+  std::size_t min_cluster_size = 100;               ///< voxels; smaller clusters are no segments
+  std::size_t max_cluster_size = 15000;             ///< voxels; larger clusters are no segments
+  BoundaryPolicy boundary = BoundaryPolicy::kKeep;  ///< what becomes of segments at the boundary of the local map
 };
 
 /// Why tracking of a segment ended; see the table of METHOD 3 for what it means to the target map.
@@ -34,40 +35,44 @@ enum class RetirementCause {
   kLeft       ///< all its points have left the local map: its views stay
 };
 
+/// A segment that is tracked no longer.
 struct RetiredSegment {
-  SegmentId id = kNoSegment;
-  RetirementCause cause = RetirementCause::kLeft;
+  SegmentId id = kNoSegment;                       ///< which never returns
+  RetirementCause cause = RetirementCause::kLeft;  ///< why
 };
 
+/// Two segments that merged.
 struct RenamedSegment {
   SegmentId from = kNoSegment;  ///< the newer; it exists no longer
   SegmentId to = kNoSegment;    ///< the older
 };
 
-/// What one call changed. A segment appears in at most one of the four lists as itself (`renamed.from`, `retired`, `created`,
-/// `grown`); the target of a renaming is also in `grown` or `retired`.
+/// What one call changed. A segment appears in at most one of the four lists as itself (`renamed.from`, `retired`,
+/// `created`, `grown`); the target of a renaming is also in `grown` or `retired`.
 struct SegmentUpdate {
-  std::vector<SegmentId> created;
-  std::vector<SegmentId> grown;  ///< points came or moved
-  std::vector<RenamedSegment> renamed;
-  std::vector<RetiredSegment> retired;
+  std::vector<SegmentId> created;       ///< new segments
+  std::vector<SegmentId> grown;         ///< points came or moved
+  std::vector<RenamedSegment> renamed;  ///< merged segments
+  std::vector<RetiredSegment> retired;  ///< segments that ended
 };
 
 /// Counts for the funnel: clusters by what became of them.
 struct ClusterCounts {
-  std::size_t clusters = 0;
-  std::size_t segments = 0;
-  std::size_t too_small = 0;
-  std::size_t too_large = 0;
-  std::size_t cut = 0;
+  std::size_t clusters = 0;   ///< all
+  std::size_t segments = 0;   ///< of them, segments
+  std::size_t too_small = 0;  ///< of them, too small so far
+  std::size_t too_large = 0;  ///< of them, too large
+  std::size_t cut = 0;        ///< of them, cut by the boundary
 };
 
 /// Clusters the active voxels of a grid as they come and keeps track of segments.
 ///
-/// Clusters are the connected components over all voxels ever clustered, under the relation "within the growing radius, and
-/// accepted by the policy, when the later of the two was clustered"; a cluster never splits. Union-find over labels persists
-/// between calls; labels and clusters are reference-counted and reclaimed. Remove is O(removed), Insert O(activated * neighbours +
-/// moved), both nearly. Not thread-safe. The grid must outlive the segmenter.
+/// Clusters are the connected components over all voxels ever clustered, under the relation "within the growing radius,
+/// and accepted by the policy, when the later of the two was clustered"; a cluster never splits. Where the policy lets
+/// not every point seed, only points that may seed link; one that may not joins the flattest of the points around it
+/// that accept it, alone. Union-find over labels persists between calls; labels and clusters are reference-counted and
+/// reclaimed. Remove is O(removed), Insert O(activated * neighbours + moved), both nearly. Not thread-safe. The grid
+/// must outlive the segmenter.
 template <class Policy>
 class IncrementalSegmenter {
  public:
@@ -80,6 +85,7 @@ class IncrementalSegmenter {
   /// Clusters activated voxels and follows moved centroids.
   SegmentUpdate Insert(const VoxelUpdate& update);
 
+  /// Sums over a segment's voxels. O(1).
   const SegmentMoments& Moments(SegmentId segment) const;
   /// Voxels of the segment that are in the local map now. O(segment).
   std::vector<VoxelHandle> Voxels(SegmentId segment) const;
@@ -90,15 +96,17 @@ class IncrementalSegmenter {
   /// All tracked segments, ascending.
   std::vector<SegmentId> Segments() const;
 
+  /// Counts of clusters. O(1).
   const ClusterCounts& counts() const { return counts_; }
+  /// Memory held, about. O(1).
   std::size_t memory_bytes() const;
 
  private:
   using Label = std::uint32_t;
   using ClusterIndex = std::uint32_t;
-  static constexpr Label kNoLabel = 0xffffffffu;   // not clustered yet
-  static constexpr Label kQueued = 0xfffffffeu;    // in the region that grows now
-  static constexpr Label kMixed = 0xfffffffdu;     // of a block with voxels of several clusters
+  static constexpr Label kNoLabel = 0xffffffffu;  // not clustered yet
+  static constexpr Label kQueued = 0xfffffffeu;   // in the region that grows now
+  static constexpr Label kMixed = 0xfffffffdu;    // of a block with voxels of several clusters
   static constexpr VoxelHandle kEnd = 0xffffffffu;
 
   enum class State : std::uint8_t { kFree, kSmall, kSegment, kTooLarge, kCut };
@@ -115,8 +123,8 @@ class IncrementalSegmenter {
     bool grew = false;
     SegmentId id = kNoSegment;
     Label root = kNoLabel;
-    std::uint32_t live_voxels = 0;    // in the local map now
-    VoxelHandle first = kEnd;         // of its circular, doubly linked list of voxels
+    std::uint32_t live_voxels = 0;  // in the local map now
+    VoxelHandle first = kEnd;       // of its circular, doubly linked list of voxels
     SegmentMoments moments;
     std::vector<SegmentId> absorbed;  // IDs of segments that merged into it in this call
   };
@@ -138,7 +146,9 @@ class IncrementalSegmenter {
   Eigen::Vector3d PointOf(VoxelHandle voxel, const Eigen::Vector3f& in_block) const {
     return grid_->BlockCorner(voxel) + in_block.cast<double>();
   }
-  static std::uint64_t CellBit(VoxelHandle voxel) { return std::uint64_t{1} << (voxel % DynamicVoxelGrid::kCellsPerBlock); }
+  static std::uint64_t CellBit(VoxelHandle voxel) {
+    return std::uint64_t{1} << (voxel % DynamicVoxelGrid::kCellsPerBlock);
+  }
   BlockNode& BlockOf(VoxelHandle voxel) { return blocks_[voxel / DynamicVoxelGrid::kCellsPerBlock]; }
   Label FindRoot(Label label) const;
   void Release(Label label) const;
@@ -150,6 +160,7 @@ class IncrementalSegmenter {
   Label Meet(Label root, Label other);
   void SetBlockLabel(BlockNode* block, Label label);
   Label VisitNeighbours(VoxelHandle from, Label root);
+  void JoinFlattestCluster(VoxelHandle voxel);
   Label VisitNeighbourBlocks(VoxelHandle from, Label root);
   void AddVoxel(Label root, VoxelHandle voxel);
   Label Link(Label a, Label b);
@@ -166,19 +177,20 @@ class IncrementalSegmenter {
   const DynamicVoxelGrid* grid_;
   Policy policy_;
   NeighbourStencil stencil_;
-  mutable std::vector<Node> nodes_;          // mutable: finding a root shortens its path
+  mutable std::vector<Node> nodes_;  // mutable: finding a root shortens its path
   mutable std::vector<Label> free_nodes_;
   std::vector<Cluster> clusters_;
   std::vector<ClusterIndex> free_clusters_;
-  std::vector<VoxelNode> voxels_;            // by handle
-  std::vector<BlockNode> blocks_;            // by handle / DynamicVoxelGrid::kCellsPerBlock
+  std::vector<VoxelNode> voxels_;  // by handle
+  std::vector<BlockNode> blocks_;  // by handle / DynamicVoxelGrid::kCellsPerBlock
   std::vector<ClusterIndex> dirty_;
   std::vector<std::pair<SegmentId, ClusterIndex>> tracked_;  // ascending IDs
-  std::vector<VoxelHandle> seeds_, queue_, region_;          // work space
+  std::vector<VoxelHandle> seeds_, queue_, region_, rough_;  // work space
   SegmentId next_id_ = 1;
   ClusterCounts counts_;
 };
 
 extern template class IncrementalSegmenter<EuclideanPolicy>;
+extern template class IncrementalSegmenter<SmoothnessPolicy>;
 
 }  // namespace incremental_segmatch
