@@ -12,7 +12,7 @@ function(run)
 endfunction()
 
 file(REMOVE_RECURSE ${BUILD})
-run(${CMAKE_COMMAND} -S ${SOURCE} -B ${BUILD} -DCMAKE_BUILD_TYPE=Debug -DCMAKE_PREFIX_PATH=${PREFIX}
+run(${CMAKE_COMMAND} -S ${SOURCE} -B ${BUILD} -DCMAKE_BUILD_TYPE=Debug -DCMAKE_CXX_FLAGS_DEBUG=-O0 -DCMAKE_PREFIX_PATH=${PREFIX}
     -DPYTHON_EXECUTABLE=/usr/bin/python3 -DPython3_EXECUTABLE=/usr/bin/python3)
 run(${CMAKE_COMMAND} --build ${BUILD})
 run(${SEGMATCH} simulate --out ${BUILD}/drive --sensor VLP-16 --max-scans 3)
