@@ -76,7 +76,8 @@ class BestMatches final : public flann::ResultSet<float> {
   }
 
  private:
-  /// FLANN passes on what is strictly nearer than its bound; what is as far as the worst match may still win by its item.
+  /// FLANN passes on what is strictly nearer than its bound; what is as far as the worst match may still win by its
+  /// item.
   void SetBound(float distance) {
     bound_ = distance * distance * (1.f + kPruningMargin) + std::numeric_limits<float>::min();
   }
@@ -242,9 +243,15 @@ DescriptorIndex::~DescriptorIndex() = default;
 DescriptorIndex::DescriptorIndex(DescriptorIndex&&) noexcept = default;
 DescriptorIndex& DescriptorIndex::operator=(DescriptorIndex&&) noexcept = default;
 
-void DescriptorIndex::Insert(std::uint64_t item, const Descriptor& descriptor) { impl_->Insert(item, descriptor); }
-bool DescriptorIndex::Remove(std::uint64_t item) { return impl_->Remove(item); }
-std::size_t DescriptorIndex::size() const { return impl_->size(); }
+void DescriptorIndex::Insert(std::uint64_t item, const Descriptor& descriptor) {
+  impl_->Insert(item, descriptor);
+}
+bool DescriptorIndex::Remove(std::uint64_t item) {
+  return impl_->Remove(item);
+}
+std::size_t DescriptorIndex::size() const {
+  return impl_->size();
+}
 std::vector<DescriptorMatch> DescriptorIndex::Nearest(const Descriptor& query, std::size_t count, float radius) const {
   return impl_->Nearest(query, count, radius);
 }

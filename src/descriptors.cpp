@@ -11,8 +11,8 @@ using Solver = Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d>;
 
 constexpr double kMaxRelativeResidual = 1e-6;  // |M v - l v| / l_max that the closed form is trusted with
 
-/// Eigenvalues in ascending order and their vectors. The closed form is several times faster than the iteration, but loses
-/// the vectors of nearly equal eigenvalues.
+/// Eigenvalues in ascending order and their vectors. The closed form is several times faster than the iteration, but
+/// loses the vectors of nearly equal eigenvalues.
 Solver Decompose(const Eigen::Matrix3d& covariance) {
   Solver solver;
   solver.computeDirect(covariance);

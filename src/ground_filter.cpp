@@ -13,12 +13,13 @@ namespace {
 constexpr float kNoHeight = std::numeric_limits<float>::infinity();
 constexpr int kMaxHalfCells = 1000;
 
-// Where ground was not seen for a while it may have risen by max_slope times that distance, but over longer ones a wall's
-// upper part or a roof would pass for ground.
+// Where ground was not seen for a while it may have risen by max_slope times that distance, but over longer ones a
+// wall's upper part or a roof would pass for ground.
 constexpr float kMaxClimbM = 7.f;
 
 void Refuse(const char* name, double value, const char* remedy) {
-  throw std::invalid_argument(std::string("ground.") + name + " is " + std::to_string(value) + "; it must be " + remedy);
+  throw std::invalid_argument(std::string("ground.") + name + " is " + std::to_string(value) + "; it must be " +
+                              remedy);
 }
 
 void RequirePositive(const char* name, double value) {
@@ -54,7 +55,9 @@ void GroundFilter::PrepareElevation() {
   half_cells_ = static_cast<int>(half_cells);
 
   const int side = 2 * half_cells_;
-  const auto index = [&](int x, int y) { return static_cast<std::uint32_t>((y + half_cells_) * side + x + half_cells_); };
+  const auto index = [&](int x, int y) {
+    return static_cast<std::uint32_t>((y + half_cells_) * side + x + half_cells_);
+  };
   const auto inwards = [](int i) { return i > 0 ? i - 1 : i < -1 ? i + 1 : i; };  // -1 and 0 touch the sensor
   const auto distance2 = [](int x, int y) { return (2 * x + 1) * (2 * x + 1) + (2 * y + 1) * (2 * y + 1); };
   std::vector<std::pair<int, Cell>> cells;
@@ -115,7 +118,8 @@ GroundFilterResult GroundFilter::FilterByElevation(const Points& points_sensor,
   const float max_height = static_cast<float>(parameters_.max_height_m);
   const float cells_per_metre = static_cast<float>(1.0 / parameters_.cell_size_m);
   const auto cell_of = [&](float coordinate) {
-    const float from_rim = coordinate * cells_per_metre + static_cast<float>(half_cells_);  // never negative but by rounding
+    const float from_rim =
+        coordinate * cells_per_metre + static_cast<float>(half_cells_);  // never negative but by rounding
     return std::clamp(static_cast<int>(from_rim), 0, 2 * half_cells_ - 1);
   };
   GroundFilterResult result;

@@ -96,7 +96,9 @@ std::string FormatValue(const T& value) {
   }
 }
 
-[[noreturn]] void RefuseType(const std::string& wanted) { throw std::invalid_argument("must be " + wanted); }
+[[noreturn]] void RefuseType(const std::string& wanted) {
+  throw std::invalid_argument("must be " + wanted);
+}
 
 std::string ScalarOf(const YAML::Node& node, const char* wanted) {
   // yaml-cpp tags quoted scalars with "!": a quoted number is a word.
@@ -167,11 +169,21 @@ struct Interval {
   }
 };
 
-Interval Finite() { return {}; }
-Interval Above(double low) { return {low, false, kInfinity, false}; }
-Interval AtLeast(double low) { return {low, true, kInfinity, false}; }
-Interval Between(double low, double high) { return {low, true, high, true}; }
-Interval Inside(double low, double high) { return {low, false, high, false}; }
+Interval Finite() {
+  return {};
+}
+Interval Above(double low) {
+  return {low, false, kInfinity, false};
+}
+Interval AtLeast(double low) {
+  return {low, true, kInfinity, false};
+}
+Interval Between(double low, double high) {
+  return {low, true, high, true};
+}
+Interval Inside(double low, double high) {
+  return {low, false, high, false};
+}
 Interval OrInfinite(Interval interval) {
   interval.high_included = true;
   return interval;
@@ -195,7 +207,7 @@ struct Parameter {
   std::string key;
   std::string meaning;
   std::string range;
-  std::function<void(const YAML::Node&, Parameters&)> read;    ///< throws std::invalid_argument with the reason alone
+  std::function<void(const YAML::Node&, Parameters&)> read;  ///< throws std::invalid_argument with the reason alone
   std::function<std::string(const Parameters&)> write;
   std::function<bool(const Parameters&)> is_in_range;
 };
@@ -210,30 +222,41 @@ Parameter Choice(const char* key, Access access, const char* meaning) {
   } else {
     range = "`true`, `false`";
   }
-  return {key, meaning, range, [access](const YAML::Node& node, Parameters& p) { access(p) = ParseValue<T>(node); },
-          [access](const Parameters& p) { return FormatValue(access(p)); }, [](const Parameters&) { return true; }};
+  return {key,
+          meaning,
+          range,
+          [access](const YAML::Node& node, Parameters& p) { access(p) = ParseValue<T>(node); },
+          [access](const Parameters& p) { return FormatValue(access(p)); },
+          [](const Parameters&) { return true; }};
 }
 
 template <class Access>
 Parameter Number(const char* key, Access access, const Interval& interval, const char* meaning) {
   using T = std::decay_t<decltype(access(std::declval<Parameters&>()))>;
-  return {key, meaning, interval.Text(),
+  return {key,
+          meaning,
+          interval.Text(),
           [access](const YAML::Node& node, Parameters& p) { access(p) = ParseValue<T>(node); },
           [access](const Parameters& p) { return FormatValue(access(p)); },
           [access, interval](const Parameters& p) { return IsInside(interval, access(p)); }};
 }
 
-// The key of a parameter is the path to its member, so that it is written once. Where a type says the unit and a key must say
-// it too, the key is given.
-#define CHOICE(member, ...) Choice(#member, [](auto& p) -> auto& { return p.member; }, __VA_ARGS__)
-#define NUMBER(member, ...) Number(#member, [](auto& p) -> auto& { return p.member; }, __VA_ARGS__)
+// The key of a parameter is the path to its member, so that it is written once. Where a type says the unit and a key
+// must say it too, the key is given.
+#define CHOICE(member, ...) \
+  Choice(                   \
+      #member, [](auto& p) -> auto& { return p.member; }, __VA_ARGS__)
+#define NUMBER(member, ...) \
+  Number(                   \
+      #member, [](auto& p) -> auto& { return p.member; }, __VA_ARGS__)
 
 const std::vector<Parameter>& Table() {
   static const std::vector<Parameter> table{
       NUMBER(front_end.local_radius_m, Above(0), "radius of the local map around the sensor, horizontally"),
 
       CHOICE(front_end.ground.model,
-             "what goes as ground: nothing; what lies below a height in the sensor's frame; what lies less than a clearance "
+             "what goes as ground: nothing; what lies below a height in the sensor's frame; what lies less than a "
+             "clearance "
              "above a ground surface that is estimated from the scan"),
       NUMBER(front_end.ground.min_height_m, Finite(), "`height_threshold`: lower points go; in the sensor's frame"),
       NUMBER(front_end.ground.sensor_height_m, Above(0), "`elevation`: height of the sensor over the ground below it"),
@@ -258,14 +281,17 @@ const std::vector<Parameter>& Table() {
       NUMBER(front_end.segmenter.max_cluster_size, AtLeast(1),
              "in voxels; larger clusters are no segments; at least `min_cluster_size`"),
       CHOICE(front_end.segmenter.boundary,
-             "what becomes of a segment that the boundary of the local map cuts: it is none any more, or it stays one until it has "
+             "what becomes of a segment that the boundary of the local map cuts: it is none any more, or it stays one "
+             "until it has "
              "left entirely"),
 
       CHOICE(front_end.descriptor.eigenvalues, "the seven eigenvalue features: linearity, planarity, scattering, ..."),
-      CHOICE(front_end.descriptor.sizes, "logarithms of the sizes along the principal axes and gravity, and of the count"),
+      CHOICE(front_end.descriptor.sizes,
+             "logarithms of the sizes along the principal axes and gravity, and of the count"),
       CHOICE(front_end.descriptor.orientation, "how upright the principal axes are"),
 
-      NUMBER(front_end.view.growth_factor, Above(1), "a segment gets a new view once it has grown by this factor since its last"),
+      NUMBER(front_end.view.growth_factor, Above(1),
+             "a segment gets a new view once it has grown by this factor since its last"),
       NUMBER(front_end.view.baseline_m, Above(0),
              "or once it changed and the sensor is this far from where its last view was taken"),
 
@@ -289,34 +315,42 @@ const std::vector<Parameter>& Table() {
              "second largest standard deviation of the inlier centroids; refuses lines"),
       NUMBER(back_end.recognizer.min_sigma_m, Above(0),
              "floor of a centroid's standard deviation per axis in the covariance"),
-      CHOICE(back_end.recognizer.find_runner_up, "also look for the best clique beside the winner: evidence against ambiguity"),
-      Number("back_end.recognizer.runner_up_deadline_us",
-             [](auto& p) -> auto& { return p.back_end.recognizer.runner_up_deadline; }, AtLeast(1), "of that search"),
+      CHOICE(back_end.recognizer.find_runner_up,
+             "also look for the best clique beside the winner: evidence against ambiguity"),
+      Number(
+          "back_end.recognizer.runner_up_deadline_us",
+          [](auto& p) -> auto& { return p.back_end.recognizer.runner_up_deadline; }, AtLeast(1), "of that search"),
 
       NUMBER(back_end.recognizer.consistency.epsilon_m, Above(0),
              "by how much the distance of two segments may differ between the maps"),
       CHOICE(back_end.recognizer.consistency.method,
              "how the pairs to be tested are found; all give the same edges, `auto` takes what measured fastest"),
-      NUMBER(back_end.recognizer.consistency.cache_theta_m, Above(0),
-             "`cached`, `auto`: candidates are sought this much farther out, and kept until a centroid moved half of it"),
+      NUMBER(
+          back_end.recognizer.consistency.cache_theta_m, Above(0),
+          "`cached`, `auto`: candidates are sought this much farther out, and kept until a centroid moved half of it"),
       NUMBER(back_end.recognizer.consistency.max_vertical_slope, OrInfinite(AtLeast(0)),
-             "by how much the height difference of two segments may differ, over their distance and beyond epsilon; at least "
+             "by how much the height difference of two segments may differ, over their distance and beyond epsilon; at "
+             "least "
              "`max_tilt_rad`"),
-      CHOICE(back_end.recognizer.consistency.use_avx2, "use AVX2 on processors that have it; the edges are the same without"),
+      CHOICE(back_end.recognizer.consistency.use_avx2,
+             "use AVX2 on processors that have it; the edges are the same without"),
 
       NUMBER(back_end.recognizer.clique.min_size, AtLeast(3), "fewer consistent pairs of segments are no recognition"),
-      Number("back_end.recognizer.clique.deadline_us",
-             [](auto& p) -> auto& { return p.back_end.recognizer.clique.deadline; }, AtLeast(1),
-             "after this time of search the largest set found so far is taken"),
+      Number(
+          "back_end.recognizer.clique.deadline_us",
+          [](auto& p) -> auto& { return p.back_end.recognizer.clique.deadline; }, AtLeast(1),
+          "after this time of search the largest set found so far is taken"),
       NUMBER(back_end.recognizer.clique.max_ties, AtLeast(1), "how many maximum sets are compared at most"),
       NUMBER(back_end.recognizer.clique.max_tie_work, AtLeast(0),
              "effort of looking for further maximum sets, in 64-bit words touched: a count, so that results repeat"),
 
       NUMBER(back_end.near_points.radius_m, Above(0),
              "points of the matched segments so near to the sensor refine a recognition, if they are enough"),
-      NUMBER(back_end.near_points.min_points, AtLeast(0), "if not, the radius is doubled until they are, or all are in"),
+      NUMBER(back_end.near_points.min_points, AtLeast(0),
+             "if not, the radius is doubled until they are, or all are in"),
 
-      CHOICE(back_end.refinement.enabled, "refine a recognition on the points of its matched segments, and refuse it if that fails"),
+      CHOICE(back_end.refinement.enabled,
+             "refine a recognition on the points of its matched segments, and refuse it if that fails"),
       NUMBER(back_end.refinement.max_distance_m, Above(0),
              "of a point to its partner, in the first iteration; at least `min_distance_m`"),
       NUMBER(back_end.refinement.min_distance_m, Above(0), "the same in the last iteration"),
@@ -335,8 +369,10 @@ const std::vector<Parameter>& Table() {
              "a local segment is supported by a target segment this near, under the recognised transform"),
       NUMBER(back_end.acceptance.neighbourhood_m, Above(0),
              "and is expected to be, where any target segment is this near; at least `support_distance_m`"),
-      NUMBER(back_end.acceptance.min_coverage, Between(0, 1), "least share of the expected local segments that are supported"),
-      NUMBER(back_end.acceptance.min_margin, AtLeast(0), "inliers must outnumber the best clique beside them by so many"),
+      NUMBER(back_end.acceptance.min_coverage, Between(0, 1),
+             "least share of the expected local segments that are supported"),
+      NUMBER(back_end.acceptance.min_margin, AtLeast(0),
+             "inliers must outnumber the best clique beside them by so many"),
       NUMBER(back_end.acceptance.max_distance_m, Above(0),
              "of the query from the pose its target was seen from: odometry drifts in between"),
       NUMBER(back_end.acceptance.max_sigma_m, Above(0), "largest standard deviation of the query's position"),
@@ -406,8 +442,12 @@ const std::vector<Relation>& Relations() {
 
 // ---- Keys -----------------------------------------------------------------------------------------------------------
 
-std::string SectionOf(const std::string& key) { return key.substr(0, key.rfind('.')); }
-std::string LeafOf(const std::string& key) { return key.substr(key.rfind('.') + 1); }
+std::string SectionOf(const std::string& key) {
+  return key.substr(0, key.rfind('.'));
+}
+std::string LeafOf(const std::string& key) {
+  return key.substr(key.rfind('.') + 1);
+}
 
 bool IsSection(const std::string& path) {
   return std::any_of(Table().begin(), Table().end(),
@@ -441,7 +481,8 @@ std::string Suggest(const std::string& unknown) {
   std::set<std::string> known;
   for (const Parameter& parameter : Table()) {
     known.insert(parameter.key);
-    for (std::string section = SectionOf(parameter.key); known.insert(section).second && section.find('.') != std::string::npos;)
+    for (std::string section = SectionOf(parameter.key);
+         known.insert(section).second && section.find('.') != std::string::npos;)
       section = SectionOf(section);
   }
   std::string best;
@@ -465,7 +506,8 @@ std::string Suggest(const std::string& unknown) {
   throw std::invalid_argument(origin + (line > 0 ? ":" + std::to_string(line) : "") + ": " + key + ": " + reason);
 }
 
-void ReadSection(const YAML::Node& section, const std::string& path, const std::string& origin, Parameters* parameters) {
+void ReadSection(const YAML::Node& section, const std::string& path, const std::string& origin,
+                 Parameters* parameters) {
   std::set<std::string> seen;
   for (const auto& entry : section) {
     const std::string name = entry.first.IsScalar() ? entry.first.Scalar() : "(not a word)";
@@ -552,9 +594,12 @@ std::string ParametersAsMarkdown() {
   std::string text =
       "# Parameters\n"
       "\n"
-      "Written from the table in `src/parameters.cpp`: `SEGMATCH_WRITE_DOCS=1 parameters_test` renews it, and the test fails where it\n"
-      "is out of date. A YAML file holds any of these keys, nested by section; what it leaves out has its default. An unknown or\n"
-      "repeated key, a wrong type and a value out of range are refused by name. Suffixes tell units: `_m` metres, `_rad` radians,\n"
+      "Written from the table in `src/parameters.cpp`: `SEGMATCH_WRITE_DOCS=1 parameters_test` renews it, and the test "
+      "fails where it\n"
+      "is out of date. A YAML file holds any of these keys, nested by section; what it leaves out has its default. An "
+      "unknown or\n"
+      "repeated key, a wrong type and a value out of range are refused by name. Suffixes tell units: `_m` metres, "
+      "`_rad` radians,\n"
       "`_s` seconds, `_us` microseconds.\n";
   std::string section;
   for (const Parameter& parameter : Table()) {

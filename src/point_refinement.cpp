@@ -16,15 +16,15 @@ namespace {
 using Matrix6 = Eigen::Matrix<double, 6, 6>;
 using Vector6 = Eigen::Matrix<double, 6, 1>;
 
-constexpr float kThin = 0.2f;            // variance across over variance along, below which a neighbourhood counts as thin
+constexpr float kThin = 0.2f;  // variance across over variance along, below which a neighbourhood counts as thin
 constexpr std::size_t kMinNeighbours = 8;  // that tell a surface's direction
-constexpr double kPointWeight = 0.02;    // of a distance to a point: it has the cloud's spacing for an error
+constexpr double kPointWeight = 0.02;      // of a distance to a point: it has the cloud's spacing for an error
 constexpr std::size_t kMinPairs = 30;
 constexpr std::size_t kMaxCoarsePoints = 1000;
-constexpr double kShrink = 0.85;         // of the robust weight's width, from iteration to iteration
+constexpr double kShrink = 0.85;          // of the robust weight's width, from iteration to iteration
 constexpr double kFineWidth = 1.0 / 3.0;  // of the robust weight in the last iteration, over the distance to a partner
-constexpr double kConvergedM = 5e-4;     // motion of the points in the last iteration
-constexpr double kMaxExtentM = 1e5;      // floats are exact enough to a centimetre up to here
+constexpr double kConvergedM = 5e-4;      // motion of the points in the last iteration
+constexpr double kMaxExtentM = 1e5;       // floats are exact enough to a centimetre up to here
 constexpr std::uint32_t kNone = 0xffffffffu;
 
 Eigen::Matrix3d Cross(const Eigen::Vector3d& v) {
@@ -74,7 +74,8 @@ class CellHash {
     means.reserve(used_.size());
     for (const std::uint32_t slot : used_) {
       Eigen::Vector3f sum = Eigen::Vector3f::Zero();
-      for (std::uint32_t i = 0; i < table_[slot].count; ++i) sum += points_[table_[slot].begin + i] - points_[table_[slot].begin];
+      for (std::uint32_t i = 0; i < table_[slot].count; ++i)
+        sum += points_[table_[slot].begin + i] - points_[table_[slot].begin];
       means.push_back(points_[table_[slot].begin] + sum / static_cast<float>(table_[slot].count));
     }
     return means;
@@ -121,10 +122,12 @@ class CellHash {
   Eigen::Vector3f CellOf(const Eigen::Vector3f& p) const { return (p * per_metre_).array().floor(); }
   std::uint64_t KeyOf(const Eigen::Vector3f& p) const {
     const Eigen::Vector3f cell = CellOf(p);
-    return Pack(static_cast<std::int64_t>(cell.x()), static_cast<std::int64_t>(cell.y()), static_cast<std::int64_t>(cell.z()));
+    return Pack(static_cast<std::int64_t>(cell.x()), static_cast<std::int64_t>(cell.y()),
+                static_cast<std::int64_t>(cell.z()));
   }
   std::uint32_t SlotOf(std::uint64_t key) const {
-    return static_cast<std::uint32_t>((key * 0x9e3779b97f4a7c15u) >> 32) & static_cast<std::uint32_t>(table_.size() - 1);
+    return static_cast<std::uint32_t>((key * 0x9e3779b97f4a7c15u) >> 32) &
+           static_cast<std::uint32_t>(table_.size() - 1);
   }
   std::uint32_t FindOrAdd(std::uint64_t key) {
     std::uint32_t slot = SlotOf(key);
@@ -141,13 +144,16 @@ class CellHash {
     return nullptr;
   }
 
-  /// Calls visit(cell) for p's cell and its neighbours, skipping those that are farther than the (shrinking) squared bound.
+  /// Calls visit(cell) for p's cell and its neighbours, skipping those that are farther than the (shrinking) squared
+  /// bound.
   template <class Visit>
   void VisitCells(const Eigen::Vector3f& p, const float* bound2, Visit&& visit) const {
     const Eigen::Vector3f home = CellOf(p);
     const Eigen::Vector3f below = p - home * side_;
     const Eigen::Vector3f above = Eigen::Vector3f::Constant(side_) - below;
-    const auto gap = [&](int axis, int step) { return step == 0 ? 0.f : std::max(0.f, step < 0 ? below[axis] : above[axis]); };
+    const auto gap = [&](int axis, int step) {
+      return step == 0 ? 0.f : std::max(0.f, step < 0 ? below[axis] : above[axis]);
+    };
     static constexpr std::array<int, 3> kSteps{0, -1, 1};  // home first: its points tighten the bound
     for (const int dx : kSteps) {
       const float x2 = gap(0, dx) * gap(0, dx);
@@ -157,8 +163,9 @@ class CellHash {
         if (xy2 > *bound2) continue;
         for (const int dz : kSteps) {
           if (xy2 + gap(2, dz) * gap(2, dz) > *bound2) continue;
-          const Cell* cell = Find(Pack(static_cast<std::int64_t>(home.x()) + dx, static_cast<std::int64_t>(home.y()) + dy,
-                                       static_cast<std::int64_t>(home.z()) + dz));
+          const Cell* cell =
+              Find(Pack(static_cast<std::int64_t>(home.x()) + dx, static_cast<std::int64_t>(home.y()) + dy,
+                        static_cast<std::int64_t>(home.z()) + dz));
           if (cell != nullptr) visit(*cell);
         }
       }
@@ -212,8 +219,7 @@ Surface EstimateSurface(const CellHash& cloud, const Eigen::Vector3f& p, float r
 /// The target at one spacing, with surfaces that are estimated when they are first asked for.
 class Target {
  public:
-  Target(const std::vector<Eigen::Vector3f>& points, float side)
-      : cells_(points, side), surfaces_(points.size()) {}
+  Target(const std::vector<Eigen::Vector3f>& points, float side) : cells_(points, side), surfaces_(points.size()) {}
 
   const CellHash& cells() const { return cells_; }
   const Surface& SurfaceAt(std::uint32_t point, const CellHash& cloud, float radius) {
@@ -232,9 +238,9 @@ struct System {
   Matrix6 information = Matrix6::Zero();
   Vector6 gradient = Vector6::Zero();
   std::size_t pairs = 0;
-  double squares = 0.0;          ///< robustly weighted sum of squared residuals
+  double squares = 0.0;  ///< robustly weighted sum of squared residuals
   double weights = 0.0;
-  double thin_squares = 0.0;     ///< of the pairs across something thin, unweighted
+  double thin_squares = 0.0;  ///< of the pairs across something thin, unweighted
   std::size_t thin_pairs = 0;
   Eigen::Vector3d sum = Eigen::Vector3d::Zero();
   double sum_squared_norms = 0.0;
@@ -286,9 +292,9 @@ System BuildSystem(const std::vector<Eigen::Vector3f>& local, const Pose& T_targ
 
 /// The system about the points' center with rotations as lengths, in its eigenbasis: stiff directions and open ones.
 struct Directions {
-  Matrix6 basis;            ///< columns: perturbations about the clouds' common origin, each moving the points by some 1 m
-  Vector6 stiffness;        ///< ascending
-  int open = 0;             ///< the first so many directions are open
+  Matrix6 basis;      ///< columns: perturbations about the clouds' common origin, each moving the points by some 1 m
+  Vector6 stiffness;  ///< ascending
+  int open = 0;       ///< the first so many directions are open
 
   Directions(const System& system, double min_stiffness) {
     Matrix6 scaled = Shift(system.Center());
@@ -321,7 +327,8 @@ std::vector<Eigen::Vector3f> Center(const std::vector<Eigen::Vector3d>& points, 
   centered.reserve(points.size());
   for (const Eigen::Vector3d& p : points) {
     const Eigen::Vector3d relative = p - center;
-    if (relative.cwiseAbs().maxCoeff() < kMaxExtentM && relative.allFinite()) centered.push_back(relative.cast<float>());
+    if (relative.cwiseAbs().maxCoeff() < kMaxExtentM && relative.allFinite())
+      centered.push_back(relative.cast<float>());
   }
   return centered;
 }
@@ -346,13 +353,15 @@ std::vector<Eigen::Vector3f> Thin(const std::vector<Eigen::Vector3f>& points, st
   return thinned;
 }
 
-/// Share of the pairs that tell something of their own: neighbours share the errors of the surface that they are held to.
+/// Share of the pairs that tell something of their own: neighbours share the errors of the surface that they are held
+/// to.
 double IndependentShare(const std::vector<Eigen::Vector3f>& local, float side) {
   return static_cast<double>(CellHash(local, side).CellMeans().size()) / static_cast<double>(local.size());
 }
 
 void Refuse(const char* name, double value, const char* remedy) {
-  throw std::invalid_argument(std::string("refinement.") + name + " is " + std::to_string(value) + "; it must be " + remedy);
+  throw std::invalid_argument(std::string("refinement.") + name + " is " + std::to_string(value) + "; it must be " +
+                              remedy);
 }
 
 }  // namespace
@@ -365,7 +374,8 @@ void Validate(const RefinementParameters& parameters) {
   if (parameters.max_iterations < 1) Refuse("max_iterations", parameters.max_iterations, "at least 1");
   if (!(parameters.min_overlap >= 0.0 && parameters.min_overlap <= 1.0))
     Refuse("min_overlap", parameters.min_overlap, "between 0 and 1");
-  if (!is_length(parameters.normal_radius_m)) Refuse("normal_radius_m", parameters.normal_radius_m, "positive and finite");
+  if (!is_length(parameters.normal_radius_m))
+    Refuse("normal_radius_m", parameters.normal_radius_m, "positive and finite");
   if (parameters.max_points < kMinPairs)
     Refuse("max_points", static_cast<double>(parameters.max_points), "at least 30");
   if (!(parameters.min_stiffness > 0.0 && parameters.min_stiffness < 1.0))
@@ -399,8 +409,8 @@ std::optional<RefinedTransform> RefineOnPoints(const std::vector<Eigen::Vector3d
     const bool is_last = width_m == last_width_m;
     const bool is_fine = width_m <= parameters.min_distance_m;
     const double distance_m = std::max(width_m, parameters.min_distance_m);
-    const System system = BuildSystem(is_last ? local : coarse_local, T, is_fine ? &fine : &coarse, fine.cells(), radius,
-                                      static_cast<float>(distance_m), width_m);
+    const System system = BuildSystem(is_last ? local : coarse_local, T, is_fine ? &fine : &coarse, fine.cells(),
+                                      radius, static_cast<float>(distance_m), width_m);
     if (system.pairs < kMinPairs) return std::nullopt;
     const auto [step, length_m] = Directions(system, parameters.min_stiffness).Step(system.gradient);
     T = Perturb(step, T);
@@ -420,7 +430,8 @@ std::optional<RefinedTransform> RefineOnPoints(const std::vector<Eigen::Vector3d
   const double variance = system.squares / system.weights / IndependentShare(local, min_distance);
   Vector6 variances;
   for (int i = 0; i < 6; ++i)
-    variances[i] = i < directions.open ? std::pow(parameters.max_distance_m / 2.0, 2) : variance / directions.stiffness[i];
+    variances[i] =
+        i < directions.open ? std::pow(parameters.max_distance_m / 2.0, 2) : variance / directions.stiffness[i];
   const Matrix6 to_target_origin = Shift(center_target) * directions.basis;
   refined.covariance = to_target_origin * variances.asDiagonal() * to_target_origin.transpose();
   refined.T_target_local = Eigen::Translation3d(center_target) * T * Eigen::Translation3d(-center_local);

@@ -9,17 +9,16 @@ namespace {
 
 /// Odometry at a stamp within the trajectory, interpolated between the two poses around it.
 std::optional<Pose> OdometryAt(const std::vector<TrajectoryPose>& trajectory, StampNs stamp_ns) {
-  const auto after =
-      std::lower_bound(trajectory.begin(), trajectory.end(), stamp_ns,
-                       [](const TrajectoryPose& pose, StampNs stamp) { return pose.stamp_ns < stamp; });
+  const auto after = std::lower_bound(trajectory.begin(), trajectory.end(), stamp_ns,
+                                      [](const TrajectoryPose& pose, StampNs stamp) { return pose.stamp_ns < stamp; });
   if (after == trajectory.end()) return std::nullopt;
   if (after->stamp_ns == stamp_ns) return after->T_odom_sensor;
   if (after == trajectory.begin()) return std::nullopt;
   const TrajectoryPose& before = *std::prev(after);
-  const double share = static_cast<double>(stamp_ns - before.stamp_ns) /
-                       static_cast<double>(after->stamp_ns - before.stamp_ns);
-  const Eigen::Quaterniond rotation = Eigen::Quaterniond(before.T_odom_sensor.linear())
-                                          .slerp(share, Eigen::Quaterniond(after->T_odom_sensor.linear()));
+  const double share =
+      static_cast<double>(stamp_ns - before.stamp_ns) / static_cast<double>(after->stamp_ns - before.stamp_ns);
+  const Eigen::Quaterniond rotation =
+      Eigen::Quaterniond(before.T_odom_sensor.linear()).slerp(share, Eigen::Quaterniond(after->T_odom_sensor.linear()));
   Pose T_odom_sensor = Pose::Identity();
   T_odom_sensor.linear() = rotation.toRotationMatrix();
   T_odom_sensor.translation() =
@@ -125,9 +124,8 @@ void TargetMap::TidyViews(std::vector<SegmentView>* views) const {
     return std::make_tuple(PoseOf(a).stamp_ns, a.robot) < std::make_tuple(PoseOf(b).stamp_ns, b.robot);
   });
   while (views->size() > parameters_.max_views) {
-    const auto smallest =
-        std::min_element(views->begin(), std::prev(views->end()),
-                         [](const SegmentView& a, const SegmentView& b) { return a.size < b.size; });
+    const auto smallest = std::min_element(views->begin(), std::prev(views->end()),
+                                           [](const SegmentView& a, const SegmentView& b) { return a.size < b.size; });
     views->erase(smallest);  // of equally large ones the oldest
   }
 }

@@ -1,7 +1,7 @@
 // The file of a target map. Little-endian throughout:
 //   magic (8 bytes), version (u32), CRC-32 of the content (u32), size of the content in bytes (u64), content.
-// The content is a list of robots with their trajectories, then a list of segments with their views, bit for bit as they are
-// in memory, so that a loaded map recognises exactly as before.
+// The content is a list of robots with their trajectories, then a list of segments with their views, bit for bit as
+// they are in memory, so that a loaded map recognises exactly as before.
 
 #include <fcntl.h>
 #include <sys/stat.h>
@@ -27,13 +27,15 @@ constexpr std::uint32_t kVersion = 1;
 constexpr std::size_t kHeaderSize = 24;
 constexpr std::size_t kBufferSize = 1 << 20;
 
-std::string Reason() { return std::strerror(errno); }
+std::string Reason() {
+  return std::strerror(errno);
+}
 
 // ---- Values to bytes and back ---------------------------------------------------------------------------------------
 
 template <class T>
-using BitsOf = std::conditional_t<sizeof(T) == 1, std::uint8_t,
-                                  std::conditional_t<sizeof(T) == 4, std::uint32_t, std::uint64_t>>;
+using BitsOf =
+    std::conditional_t<sizeof(T) == 1, std::uint8_t, std::conditional_t<sizeof(T) == 4, std::uint32_t, std::uint64_t>>;
 
 template <class T>
 void PutLittleEndian(T value, unsigned char* to) {
@@ -93,7 +95,8 @@ class AtomicFile {
     buffer_.reserve(2 * kBufferSize);
     descriptor_ = ::open(unfinished_.c_str(), O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0666);
     if (descriptor_ < 0)
-      throw std::runtime_error("can't write " + path_ + ": " + Reason() + "; does its folder exist, and may it be written?");
+      throw std::runtime_error("can't write " + path_ + ": " + Reason() +
+                               "; does its folder exist, and may it be written?");
   }
   ~AtomicFile() {
     if (descriptor_ < 0) return;
@@ -336,7 +339,8 @@ void TargetMap::Save(const std::string& path) const {
 }
 
 TargetMap TargetMap::Load(const std::string& path, const TargetMapParameters& parameters) {
-  // Least bytes of an element of each list: what is refused here can't make a damaged count allocate more than the file's size.
+  // Least bytes of an element of each list: what is refused here can't make a damaged count allocate more than the
+  // file's size.
   constexpr std::size_t kPose = 12 * 8, kRobot = 8 + kPose + 8, kSegment = 4 + 4 + 8 + 8, kView = 3 * 4 + 3 * 8 + 8 + 1;
   TargetMap map(parameters);
   const std::vector<unsigned char> bytes = ReadFile(path);
@@ -356,7 +360,8 @@ TargetMap TargetMap::Load(const std::string& path, const TargetMapParameters& pa
       pose.stamp_ns = reader.Get<std::int64_t>();
       pose.T_odom_sensor = GetPose(&reader);
       pose.T_map_sensor = GetPose(&reader);
-      reader.Require(previous == nullptr || previous->stamp_ns < pose.stamp_ns, "stamps of a trajectory do not increase");
+      reader.Require(previous == nullptr || previous->stamp_ns < pose.stamp_ns,
+                     "stamps of a trajectory do not increase");
       previous = &pose;
     }
   }

@@ -18,7 +18,9 @@ constexpr float kInfinity = std::numeric_limits<float>::infinity();
 
 using Oracle = std::map<std::uint64_t, Descriptor>;
 
-double TrueDistance(const Descriptor& a, const Descriptor& b) { return (a - b).cast<double>().norm(); }
+double TrueDistance(const Descriptor& a, const Descriptor& b) {
+  return (a - b).cast<double>().norm();
+}
 
 std::vector<double> BruteForce(const Oracle& oracle, const Descriptor& query, std::size_t count, double radius) {
   std::vector<double> distances;

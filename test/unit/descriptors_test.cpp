@@ -106,8 +106,9 @@ TEST(Describer, AgreesWithATwoPassOracle) {
     std::mt19937 random(seed);
     std::uniform_real_distribution<double> size(0.1, 8.0), far(-1e5, 1e5);
     std::normal_distribution<double> normal;
-    const Eigen::Matrix3d R =
-        Eigen::Quaterniond(normal(random), normal(random), normal(random), normal(random)).normalized().toRotationMatrix();
+    const Eigen::Matrix3d R = Eigen::Quaterniond(normal(random), normal(random), normal(random), normal(random))
+                                  .normalized()
+                                  .toRotationMatrix();
     Eigen::Vector3d extent(size(random), size(random), size(random));
     if (seed % 3 == 1) extent[1] = extent[0];
     const auto points = RandomBox(random, extent, R, {far(random), far(random), far(random)}, 200);

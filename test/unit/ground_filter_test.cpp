@@ -190,9 +190,9 @@ TEST(GroundFilter, ElevationMeasuresAlongGravityWhateverTheSensorsTilt) {
   const Shot shot = Shoot([](double, double) { return 0.0; }, Boxes(), random);
   for (const double tilt : {-0.2, 0.2}) {
     Pose T_gravity_sensor = Pose::Identity();
-    T_gravity_sensor.linear() = (Eigen::AngleAxisd(1.0, Eigen::Vector3d::UnitZ()) *
-                                 Eigen::AngleAxisd(tilt, Eigen::Vector3d::UnitY()))
-                                    .toRotationMatrix();
+    T_gravity_sensor.linear() =
+        (Eigen::AngleAxisd(1.0, Eigen::Vector3d::UnitZ()) * Eigen::AngleAxisd(tilt, Eigen::Vector3d::UnitY()))
+            .toRotationMatrix();
     T_gravity_sensor.translation() << 100, 200, 300;  // has no effect
     const Rates rates = Measure(shot, T_gravity_sensor);
     EXPECT_GT(rates.ground_removed, 0.999);

@@ -43,7 +43,8 @@ std::string Complaint(const std::string& yaml) {
 
 void ExpectComplaint(const std::string& yaml, const std::vector<std::string>& parts) {
   const std::string complaint = Complaint(yaml);
-  for (const std::string& part : parts) EXPECT_NE(complaint.find(part), std::string::npos) << complaint << "\nlacks: " << part;
+  for (const std::string& part : parts)
+    EXPECT_NE(complaint.find(part), std::string::npos) << complaint << "\nlacks: " << part;
 }
 
 TEST(Parameters, NothingGivesTheDefaults) {
@@ -88,9 +89,11 @@ back_end:
 TEST(Parameters, UnknownKeysAreRefusedWithASuggestion) {
   ExpectComplaint("front_end: {grid: {resolution: 0.2}}",
                   {"test:1: front_end.grid.resolution: ", "did you mean front_end.grid.resolution_m?"});
-  ExpectComplaint("front_end:\n  resolution_m: 0.2", {"test:2: front_end.resolution_m: ", "front_end.grid.resolution_m?"});
+  ExpectComplaint("front_end:\n  resolution_m: 0.2",
+                  {"test:2: front_end.resolution_m: ", "front_end.grid.resolution_m?"});
   ExpectComplaint("frontend: {}", {"frontend: ", "did you mean front_end?"});
-  ExpectComplaint("back_end: {recogniser: {max_rms_m: 1}}", {"back_end.recogniser: ", "did you mean back_end.recognizer?"});
+  ExpectComplaint("back_end: {recogniser: {max_rms_m: 1}}",
+                  {"back_end.recogniser: ", "did you mean back_end.recognizer?"});
   ExpectComplaint("back_end: {recognizer: {min_size: 7}}", {"back_end.recognizer.clique.min_size?"});
   ExpectComplaint("{[1, 2]: 3}", {"is no parameter"});
 }
@@ -109,7 +112,8 @@ TEST(Parameters, WrongTypesAreRefused) {
   ExpectComplaint("front_end: {local_radius_m: [40]}", {"front_end.local_radius_m: must be a number"});
   ExpectComplaint("front_end: {grid: {min_points_per_voxel: 1.5}}", {"min_points_per_voxel: must be a whole number"});
   ExpectComplaint("front_end: {grid: {min_points_per_voxel: 99999999999}}", {"is beyond the range of its type"});
-  ExpectComplaint("front_end: {segmenter: {max_cluster_size: -1}}", {"max_cluster_size: is beyond the range of its type"});
+  ExpectComplaint("front_end: {segmenter: {max_cluster_size: -1}}",
+                  {"max_cluster_size: is beyond the range of its type"});
   ExpectComplaint("front_end: {descriptor: {sizes: 1}}", {"front_end.descriptor.sizes: must be true or false"});
   ExpectComplaint("front_end: {grid: {bits: [21, 21]}}", {"front_end.grid.bits: must be a list of 3 numbers"});
   ExpectComplaint("front_end: {ground: {model: plane}}", {"must be one of none, height_threshold, elevation"});
@@ -121,8 +125,10 @@ TEST(Parameters, ValuesOutOfRangeAreRefused) {
   ExpectComplaint("front_end: {grid: {resolution_m: .nan}}", {"front_end.grid.resolution_m: must be > 0, is .nan"});
   ExpectComplaint("front_end: {grid: {resolution_m: .inf}}", {"front_end.grid.resolution_m: must be > 0, is .inf"});
   ExpectComplaint("front_end: {grid: {bits: [21, 21, 24]}}", {"front_end.grid.bits: must be >= 3, <= 23"});
-  ExpectComplaint("back_end: {recognizer: {clique: {min_size: 2}}}", {"back_end.recognizer.clique.min_size: must be >= 3"});
-  ExpectComplaint("back_end: {refinement: {min_overlap: 1.01}}", {"back_end.refinement.min_overlap: must be >= 0, <= 1"});
+  ExpectComplaint("back_end: {recognizer: {clique: {min_size: 2}}}",
+                  {"back_end.recognizer.clique.min_size: must be >= 3"});
+  ExpectComplaint("back_end: {refinement: {min_overlap: 1.01}}",
+                  {"back_end.refinement.min_overlap: must be >= 0, <= 1"});
   ExpectComplaint("back_end: {refinement: {min_stiffness: 1}}", {"min_stiffness: must be > 0, < 1, is 1"});
 }
 
@@ -132,9 +138,11 @@ TEST(Parameters, RelationsBetweenParametersAreChecked) {
   ExpectComplaint("front_end: {ground: {min_range_m: 50}}", {"front_end.ground.max_range_m: "});
   ExpectComplaint("front_end: {ground: {model: elevation, max_slope: 0.5}}", {"front_end.ground.clearance_m: "});
   ExpectComplaint("front_end: {ground: {model: elevation, cell_size_m: 0.01}}", {"front_end.ground.cell_size_m: "});
-  ExpectComplaint("front_end: {descriptor: {eigenvalues: false, sizes: false, orientation: false}}", {"front_end.descriptor: "});
+  ExpectComplaint("front_end: {descriptor: {eigenvalues: false, sizes: false, orientation: false}}",
+                  {"front_end.descriptor: "});
   ExpectComplaint("back_end: {matching: {nearest: 0}}", {"back_end.matching: "});
-  ExpectComplaint("back_end: {recognizer: {max_tilt_rad: 0.2}}", {"back_end.recognizer.consistency.max_vertical_slope: "});
+  ExpectComplaint("back_end: {recognizer: {max_tilt_rad: 0.2}}",
+                  {"back_end.recognizer.consistency.max_vertical_slope: "});
   ExpectComplaint("back_end: {refinement: {min_distance_m: 2}}", {"back_end.refinement.max_distance_m: "});
   ExpectComplaint("back_end: {acceptance: {neighbourhood_m: 0.5}}", {"back_end.acceptance.neighbourhood_m: "});
 }
@@ -151,7 +159,8 @@ TEST(Parameters, WhatIsNoYamlIsARuntimeError) {
 }
 
 TEST(Parameters, FilesThatCanNotBeReadAreNamed) {
-  for (const std::string& path : {std::string("/nowhere/at/all.yaml"), std::filesystem::temp_directory_path().string()}) {
+  for (const std::string& path :
+       {std::string("/nowhere/at/all.yaml"), std::filesystem::temp_directory_path().string()}) {
     try {
       LoadParameters(path);
       ADD_FAILURE() << "read " << path;
@@ -173,8 +182,9 @@ TEST(Parameters, AnEmptyFileGivesTheDefaults) {
 // A value near the default, now and then far off: what the type of the default's text allows.
 std::string RandomValue(const std::string& text, std::mt19937& random) {
   std::uniform_real_distribution<double> uniform(0.0, 1.0);
-  static const std::set<std::string> words{"none", "height_threshold", "elevation", "invalidate", "keep",   "true", "false",
-                                           "loop_closure", "all_pairs", "partitioned_2d", "partitioned_3d", "cached"};
+  static const std::set<std::string> words{
+      "none",  "height_threshold", "elevation", "invalidate",     "keep",           "true",
+      "false", "loop_closure",     "all_pairs", "partitioned_2d", "partitioned_3d", "cached"};
   if (words.count(text) != 0 || text.front() == '[') return text;
   const double value = std::strtod(text.c_str(), nullptr);
   const bool is_whole = text.find_first_of(".e") == std::string::npos && std::abs(value) >= 1.0;
@@ -265,7 +275,8 @@ TEST(Parameters, EveryMemberOfEveryStructIsInTheTable) {
   const auto entries = [](const std::string& section) {
     std::set<std::string> names;
     for (const std::string& key : ParameterKeys())
-      if (key.rfind(section + '.', 0) == 0) names.insert(key.substr(section.size() + 1, key.find('.', section.size() + 1) - section.size() - 1));
+      if (key.rfind(section + '.', 0) == 0)
+        names.insert(key.substr(section.size() + 1, key.find('.', section.size() + 1) - section.size() - 1));
     return names.size();
   };
   EXPECT_EQ(entries("front_end"), CountMembers<FrontEndParameters>());
@@ -321,7 +332,8 @@ TEST(Parameters, KittiIsTheReleasedConfiguration) {
 TEST(Parameters, ThePageIsUpToDate) {
   const std::string path = std::string(SEGMATCH_SOURCE_DIR) + "/docs/parameters.md";
   if (std::getenv("SEGMATCH_WRITE_DOCS") != nullptr) std::ofstream(path, std::ios::binary) << ParametersAsMarkdown();
-  EXPECT_TRUE(ReadText(path) == ParametersAsMarkdown()) << path << " is out of date; renew it: SEGMATCH_WRITE_DOCS=1 parameters_test";
+  EXPECT_TRUE(ReadText(path) == ParametersAsMarkdown())
+      << path << " is out of date; renew it: SEGMATCH_WRITE_DOCS=1 parameters_test";
 }
 
 }  // namespace

@@ -58,19 +58,23 @@ void Sample(const Object& object, double points_per_m2, double noise_m, std::mt1
   };
   if (object.kind == Object::kBox) {
     for (const double side : {-0.5, 0.5}) {
-      repeat(s.y() * s.z(), [&] { return Eigen::Vector3d(side * s.x(), uniform(random) * s.y(), (uniform(random) + 0.5) * s.z()); });
-      repeat(s.x() * s.z(), [&] { return Eigen::Vector3d(uniform(random) * s.x(), side * s.y(), (uniform(random) + 0.5) * s.z()); });
+      repeat(s.y() * s.z(),
+             [&] { return Eigen::Vector3d(side * s.x(), uniform(random) * s.y(), (uniform(random) + 0.5) * s.z()); });
+      repeat(s.x() * s.z(),
+             [&] { return Eigen::Vector3d(uniform(random) * s.x(), side * s.y(), (uniform(random) + 0.5) * s.z()); });
     }
     repeat(s.x() * s.y(), [&] { return Eigen::Vector3d(uniform(random) * s.x(), uniform(random) * s.y(), s.z()); });
     return;
   }
   repeat(M_PI * s.x() * s.z(), [&] {
     const double angle = 2.0 * M_PI * uniform(random);
-    return Eigen::Vector3d(0.5 * s.x() * std::cos(angle), 0.5 * s.x() * std::sin(angle), (uniform(random) + 0.5) * s.z());
+    return Eigen::Vector3d(0.5 * s.x() * std::cos(angle), 0.5 * s.x() * std::sin(angle),
+                           (uniform(random) + 0.5) * s.z());
   });
 }
 
-Cloud Sample(const std::vector<Object>& objects, std::mt19937& random, double points_per_m2 = 25.0, double noise_m = 0.02) {
+Cloud Sample(const std::vector<Object>& objects, std::mt19937& random, double points_per_m2 = 25.0,
+             double noise_m = 0.02) {
   Cloud cloud;
   for (const Object& object : objects) Sample(object, points_per_m2, noise_m, random, &cloud);
   return cloud;
@@ -107,7 +111,9 @@ Problem MakeProblem(std::mt19937& random, double radius_m = 20.0) {
 }
 
 // Given the truth disturbed about the scene's middle.
-Pose Disturb(const Problem& problem, const Pose& disturbance) { return problem.T_target_local * disturbance; }
+Pose Disturb(const Problem& problem, const Pose& disturbance) {
+  return problem.T_target_local * disturbance;
+}
 
 Eigen::Matrix<double, 6, 1> ErrorAboutOrigin(const Pose& T_true, const Pose& T) {
   const Pose error = T_true * T.inverse();
@@ -117,7 +123,8 @@ Eigen::Matrix<double, 6, 1> ErrorAboutOrigin(const Pose& T_true, const Pose& T) 
   return xi;
 }
 
-// Errors of one seed: metres and radians about the scene's middle, and in standard deviations of the reported covariance.
+// Errors of one seed: metres and radians about the scene's middle, and in standard deviations of the reported
+// covariance.
 struct Outcome {
   double translation_m;
   double rotation_rad;
@@ -188,7 +195,8 @@ TEST(PointRefinement, DoesNotDependOnWhereTheFramesHaveTheirOrigins) {
   EXPECT_LT((back.matrix() - near->T_target_local.matrix()).cwiseAbs().maxCoeff(), 1e-3);
   // The translation's uncertainty about the far origin contains the rotation's times the lever arm.
   const double lever_m = std::hypot(far_target.x(), far_target.y());
-  EXPECT_GT(std::sqrt(far->covariance(0, 0) + far->covariance(1, 1)), 0.5 * lever_m * std::sqrt(near->covariance(5, 5)));
+  EXPECT_GT(std::sqrt(far->covariance(0, 0) + far->covariance(1, 1)),
+            0.5 * lever_m * std::sqrt(near->covariance(5, 5)));
   EXPECT_NEAR(std::sqrt(far->covariance(5, 5) / near->covariance(5, 5)), 1.0, 0.05);
 }
 
@@ -205,7 +213,8 @@ TEST(PointRefinement, IsDeterministic) {
 
 TEST(PointRefinement, RefusesCloudsThatDoNotOverlap) {
   std::mt19937 random(3);
-  const Cloud here = Sample(RandomScene(random, 10, 20.0), random), there = Sample(RandomScene(random, 10, 20.0), random);
+  const Cloud here = Sample(RandomScene(random, 10, 20.0), random),
+              there = Sample(RandomScene(random, 10, 20.0), random);
   EXPECT_FALSE(RefineOnPoints(here, there, Pose(Eigen::Translation3d(100, 0, 0)), {}));
   RefinementParameters strict;
   strict.min_overlap = 0.9;
@@ -233,7 +242,8 @@ Cloud Walls(const std::vector<Eigen::Vector3d>& from_length_yaw, std::mt19937& r
 
 TEST(PointRefinement, RefusesACorridorAndAWall) {
   std::mt19937 random(4);
-  const std::vector<Eigen::Vector3d> wall{{0, 0, 0}, {30, 0, 0}}, corridor{{0, 0, 0}, {30, 0, 0}, {0, 4, 0}, {30, 0, 0}};
+  const std::vector<Eigen::Vector3d> wall{{0, 0, 0}, {30, 0, 0}},
+      corridor{{0, 0, 0}, {30, 0, 0}, {0, 4, 0}, {30, 0, 0}};
   for (const auto& walls : {wall, corridor}) {
     const Cloud a = Walls(walls, random), b = Walls(walls, random);
     EXPECT_FALSE(RefineOnPoints(a, b, Pose(Eigen::Translation3d(0.1, 0.1, 0)), {}));
@@ -242,7 +252,8 @@ TEST(PointRefinement, RefusesACorridorAndAWall) {
 
 TEST(PointRefinement, KeepsTheGivenPoseWhereThePointsLeaveItOpen) {
   std::mt19937 random(5);
-  const std::vector<Eigen::Vector3d> walls{{0, 0, 0}, {15, 0, 0}, {0, 0, 0}, {12, M_PI / 2, 0}, {18, 2, 0}, {10, 2.0, 0}};
+  const std::vector<Eigen::Vector3d> walls{{0, 0, 0},         {15, 0, 0}, {0, 0, 0},
+                                           {12, M_PI / 2, 0}, {18, 2, 0}, {10, 2.0, 0}};
   const Cloud a = Walls(walls, random), b = Walls(walls, random);
   const auto refined = RefineOnPoints(a, b, Pose(Eigen::Translation3d(0.3, -0.2, 0.15)), {});
   ASSERT_TRUE(refined);
@@ -262,7 +273,8 @@ TEST(PointRefinement, HasNothingToSayAboutNothing) {
   EXPECT_FALSE(RefineOnPoints({}, {}, Pose::Identity(), {}));
   EXPECT_FALSE(RefineOnPoints({}, cloud, Pose::Identity(), {}));
   EXPECT_FALSE(RefineOnPoints(cloud, {}, Pose::Identity(), {}));
-  EXPECT_FALSE(RefineOnPoints(Cloud(1000, Eigen::Vector3d(1, 2, 3)), Cloud(1000, Eigen::Vector3d(1, 2, 3)), Pose::Identity(), {}));
+  EXPECT_FALSE(RefineOnPoints(Cloud(1000, Eigen::Vector3d(1, 2, 3)), Cloud(1000, Eigen::Vector3d(1, 2, 3)),
+                              Pose::Identity(), {}));
 }
 
 TEST(PointRefinement, IgnoresPointsThatAreNotFinite) {

@@ -28,7 +28,9 @@ constexpr std::size_t kHeaderSize = 24;
 Pose RandomPose(std::mt19937& random) {
   std::normal_distribution<double> normal;
   Pose T = Pose::Identity();
-  T.linear() = Eigen::Quaterniond(normal(random), normal(random), normal(random), normal(random)).normalized().toRotationMatrix();
+  T.linear() = Eigen::Quaterniond(normal(random), normal(random), normal(random), normal(random))
+                   .normalized()
+                   .toRotationMatrix();
   T.translation() << 1e4 * normal(random), 1e4 * normal(random), normal(random);
   return T;
 }
@@ -220,7 +222,8 @@ TEST_F(TargetMapFile, RandomDamageIsNoticed) {
 
 TEST_F(TargetMapFile, TruncationIsNoticedAsSuch) {
   const Bytes whole = Saved(RandomMap(3, 2, 3, 4));
-  for (std::size_t size = 1; size < whole.size(); size += size < 64 ? 1 : 17) ExpectRefused(whole.substr(0, size), "is truncated");
+  for (std::size_t size = 1; size < whole.size(); size += size < 64 ? 1 : 17)
+    ExpectRefused(whole.substr(0, size), "is truncated");
   ExpectRefused("", "is empty");
 }
 
@@ -317,7 +320,7 @@ TEST_F(TargetMapFile, SavingWhereNothingCanBeWrittenIsRefused) {
 // A disk that is full in the middle of a save: the size limit of files stands in for it.
 [[noreturn]] void SaveOnAFullDisk(const TargetMap& map, const std::string& path) {
   std::signal(SIGXFSZ, SIG_IGN);
-  const struct rlimit limit {4096, 4096};
+  const struct rlimit limit { 4096, 4096 };
   ::setrlimit(RLIMIT_FSIZE, &limit);
   try {
     map.Save(path);

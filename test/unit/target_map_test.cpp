@@ -74,8 +74,8 @@ TEST(TargetMap, CorrectedPosesAreTakenExactlyAndOthersFollow) {
   EXPECT_EQ(trajectory[6].T_map_sensor.matrix(), at6.matrix());
   for (int i = 0; i < 10; ++i) {
     const int leader = i < 6 ? 3 : 6;
-    const Pose expected = trajectory[leader].T_map_sensor * trajectory[leader].T_odom_sensor.inverse() *
-                          trajectory[i].T_odom_sensor;
+    const Pose expected =
+        trajectory[leader].T_map_sensor * trajectory[leader].T_odom_sensor.inverse() * trajectory[i].T_odom_sensor;
     EXPECT_TRUE(trajectory[i].T_map_sensor.isApprox(expected, 1e-12)) << i;
     EXPECT_EQ(trajectory[i].T_odom_sensor.matrix(), MakePose(i, 0, 0, 0.1 * i).matrix()) << "odometry stays";
   }
