@@ -42,6 +42,10 @@ std::optional<Eigen::Vector3d> PositionAt(const TargetMap& map, const std::strin
 }  // namespace
 
 BackEndNodelet::~BackEndNodelet() {
+  // First, so that no callback runs any more when the worker goes.
+  for (ros::Subscriber& subscriber : subscribers_) subscriber.shutdown();
+  save_service_.shutdown();
+  load_service_.shutdown();
   diagnostics_timer_.stop();
   worker_.reset();
 }

@@ -28,6 +28,11 @@ bool HasFinitePoint(const Points& points) {
 }  // namespace
 
 FrontEndNodelet::~FrontEndNodelet() {
+  // First, so that no callback runs any more when the worker goes.
+  cloud_subscriber_.shutdown();
+  odometry_subscriber_.shutdown();
+  trajectory_subscriber_.shutdown();
+  full_state_service_.shutdown();
   diagnostics_timer_.stop();
   worker_.reset();
 }

@@ -22,6 +22,9 @@ std::string FileName(const std::string& folder, const std::string& name, const s
 }  // namespace
 
 PoseGraphNodelet::~PoseGraphNodelet() {
+  // First, so that no callback runs any more when the worker goes.
+  for (ros::Subscriber& subscriber : subscribers_) subscriber.shutdown();
+  write_service_.shutdown();
   diagnostics_timer_.stop();
   const bool started = worker_ != nullptr;
   worker_.reset();
