@@ -37,7 +37,7 @@ struct MatchingParameters {
 /// Which points of the matched segments refine a recognition: the nearer they are to the sensor, the less has odometry
 /// drifted between them and the closure's two poses.
 struct NearPointsParameters {
-  double radius_m = 25.0;         ///< points so near to the query's sensor are used, if they are enough
+  double radius_m = 35.0;         ///< points so near to the query's sensor are used, if they are enough
   std::size_t min_points = 1500;  ///< if not, the radius is doubled until they are, or all are in
 };
 

@@ -22,6 +22,7 @@ struct EuclideanPolicy {
   bool CanGrowToPoint(VoxelHandle, VoxelHandle) const { return true; }
   /// Any voxel may seed.
   bool CanPointBeSeed(VoxelHandle) const { return true; }
+  /// No voxel is flatter than another.
   float Roughness(VoxelHandle) const { return 0.f; }
 };
 
