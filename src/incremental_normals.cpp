@@ -1,5 +1,9 @@
 #include "incremental_segmatch/incremental_normals.hpp"
 
+#if defined(__SSE2__)
+#include <emmintrin.h>
+#endif
+
 #include <Eigen/Geometry>
 #include <algorithm>
 #include <cmath>
@@ -11,24 +15,18 @@ namespace incremental_segmatch {
 namespace {
 
 constexpr VoxelHandle kCells = DynamicVoxelGrid::kCellsPerBlock;
-constexpr int kSide = DynamicVoxelGrid::kBlockSide;
+constexpr unsigned kSide = DynamicVoxelGrid::kBlockSide;
 
-/// What positions relative to the accumulators' reference contribute: products of integers, exact in float.
-struct Contribution {
-  Eigen::Array4f squares = Eigen::Array4f::Zero(), products = Eigen::Array4f::Zero(), sum = Eigen::Array4f::Zero();
-
-  void Add(const Eigen::Array4f& p) {
-    squares += p * p;
-    products += p * Rotated(p);
-    sum += p;
-  }
-  void Subtract(const Eigen::Array4f& p) {
-    squares -= p * p;
-    products -= p * Rotated(p);
-    sum -= p;
-  }
-  static Eigen::Array4f Rotated(const Eigen::Array4f& p) { return {p[1], p[2], p[0], p[3]}; }
-};
+/// Bit i is set where lane i is at most the limit.
+std::uint64_t LanesAtMost(const Eigen::Array4f& lanes, float limit) {
+#if defined(__SSE2__)
+  return static_cast<std::uint64_t>(_mm_movemask_ps(_mm_cmple_ps(_mm_loadu_ps(lanes.data()), _mm_set1_ps(limit))));
+#else
+  std::uint64_t bits = 0;
+  for (int i = 0; i < 4; ++i) bits |= static_cast<std::uint64_t>(lanes[i] <= limit) << i;
+  return bits;
+#endif
+}
 
 /// The finest power of two of units per cell for which all sums over a full neighbourhood are exact: products in float, sums in
 /// 32 bits. A neighbour lies within the radius of a point that is at most half a cell from the reference, on each axis.
@@ -97,16 +95,24 @@ IncrementalNormals::IncrementalNormals(const NormalsParameters& parameters, cons
     throw std::invalid_argument("normals.renewal_tolerance_voxels: must not be negative, is " +
                                 std::to_string(parameters.renewal_tolerance_voxels));
   units_per_cell_ = UnitsPerCell(stencil_, radius_cells);
-  for (int cell = 0; cell < static_cast<int>(kCells); ++cell) {
-    const Eigen::Array4i indices(cell % kSide, cell / kSide % kSide, cell / (kSide * kSide), 0);
-    cell_centers_[cell] = (indices * units_per_cell_ + Eigen::Array4i(1, 1, 1, 0) * (units_per_cell_ / 2)).cast<float>();
-  }
+  const auto center_of = [&](unsigned index) { return (static_cast<float>(index) + 0.5f) * static_cast<float>(units_per_cell_); };
+  for (unsigned cell = 0; cell < kCells; ++cell)
+    cell_centers_[cell] = Position(center_of(cell % kSide), center_of(cell / kSide % kSide), center_of(cell / (kSide * kSide)), 0.f);
   unit_m_ = resolution_m / units_per_cell_;
   units_per_m_ = static_cast<float>(1.0 / unit_m_);
   const double radius_units = radius_cells * units_per_cell_ * (1.0 + 1e-9);  // radii that are whole voxels are whole units
   radius2_units_ = static_cast<float>(std::floor(radius_units * radius_units));
   const double tolerance_units = parameters.renewal_tolerance_voxels * units_per_cell_;
   tolerance2_units_ = static_cast<float>(tolerance_units * tolerance_units);
+}
+
+/// Adds (sign 1) or takes out (-1) what a position relative to the accumulators' reference contributes: products of integers, exact
+/// in float.
+template <int kSign>
+void IncrementalNormals::Accumulate(const Position& p, Moments* moments) {
+  moments->squares += kSign * (p.xyz1 * p.xyz1).cast<int>();
+  moments->products += kSign * (p.xyz1 * p.yzx1).cast<int>();
+  moments->sum += kSign * p.xyz1.cast<int>();
 }
 
 void IncrementalNormals::Remove(const std::vector<RemovedVoxel>& removed) {
@@ -117,7 +123,7 @@ void IncrementalNormals::Remove(const std::vector<RemovedVoxel>& removed) {
     masks_[gone.voxel / kCells].anchored &= ~(std::uint64_t{1} << (gone.voxel % kCells));
     leaving_.push_back(gone.voxel);
   }
-  for (const VoxelHandle voxel : leaving_) Replace<true, false>(voxel, Position::Zero());
+  for (const VoxelHandle voxel : leaving_) Replace<true, false>(voxel, Position());
 }
 
 void IncrementalNormals::Insert(const VoxelUpdate& update) {
@@ -127,8 +133,8 @@ void IncrementalNormals::Insert(const VoxelUpdate& update) {
   renewing_.clear();
   for (const MovedVoxel& moved : update.moved) {
     const Position position = PositionOf(moved.voxel, moved.after_block);
-    const Position& anchor = blocks_[moved.voxel / kCells].anchors[moved.voxel % kCells];
-    if ((position - anchor).matrix().squaredNorm() > tolerance2_units_) renewing_.push_back(moved.voxel);
+    const Position anchor = blocks_[moved.voxel / kCells].Anchor(moved.voxel % kCells);
+    if ((position - anchor).xyz1.matrix().squaredNorm() > tolerance2_units_) renewing_.push_back(moved.voxel);
   }
   std::sort(renewing_.begin(), renewing_.end());
   for (const VoxelHandle voxel : renewing_) Replace<true, true>(voxel, PositionOf(voxel, grid_->CentroidInBlock(voxel)));
@@ -137,13 +143,27 @@ void IncrementalNormals::Insert(const VoxelUpdate& update) {
 }
 
 IncrementalNormals::Position IncrementalNormals::PositionOf(VoxelHandle voxel, const Eigen::Vector3f& in_block) const {
-  const Position& center = cell_centers_[voxel % kCells];
+  const Lanes& center = cell_centers_[voxel % kCells].xyz1;
   const float half = 0.5f * static_cast<float>(units_per_cell_);
-  Position position;
-  for (int axis = 0; axis < 3; ++axis)  // rounding must not carry it out of its cell
-    position[axis] = std::clamp(std::floor(in_block[axis] * units_per_m_ + 0.5f), center[axis] - half, center[axis] + half);
-  position[3] = 1.f;
-  return position;
+  const auto round = [&](int axis) {  // must not carry it out of its cell
+    return std::clamp(std::floor(in_block[axis] * units_per_m_ + 0.5f), center[axis] - half, center[axis] + half);
+  };
+  return {round(0), round(1), round(2)};
+}
+
+/// Which of the cells have their anchors within the radius of a position, both relative to the block's corner.
+std::uint64_t IncrementalNormals::CellsWithinRadius(const Block& block, std::uint64_t cells, const Position& position) const {
+  const Lanes x = Lanes::Constant(position.xyz1[0]), y = Lanes::Constant(position.xyz1[1]), z = Lanes::Constant(position.xyz1[2]);
+  std::uint64_t within = 0;
+  for (std::uint64_t rest = cells; rest != 0;) {
+    const unsigned row = static_cast<unsigned>(__builtin_ctzll(rest)) & ~(kSide - 1);
+    const Lanes dx = Eigen::Map<const Lanes>(&block.anchors[0][row]) - x;
+    const Lanes dy = Eigen::Map<const Lanes>(&block.anchors[1][row]) - y;
+    const Lanes dz = Eigen::Map<const Lanes>(&block.anchors[2][row]) - z;
+    within |= LanesAtMost(dx * dx + dy * dy + dz * dz, radius2_units_) << row;
+    rest &= ~(std::uint64_t{0xf} << row);
+  }
+  return within & cells;
 }
 
 /// The voxel takes back what it gave as of its anchor (kWithdraw), and gives anew as of the position, its anchor from now on (kGive).
@@ -153,62 +173,54 @@ void IncrementalNormals::Replace(VoxelHandle voxel, const Position& position) {
   const unsigned cell = voxel % kCells;
   const std::uint32_t home = voxel / kCells;
   Moments own = blocks_[home].moments[cell];
-  const Position before = blocks_[home].anchors[cell];
-  if (!kWithdraw) own = {Eigen::Array4i::Zero(), Eigen::Array4i::Zero(), Eigen::Array4i::Zero()};
+  const Position before = blocks_[home].Anchor(cell);
   const Position& center = cell_centers_[cell];
-  const auto give = [](const Contribution& contribution, Moments* to) {
-    to->squares += contribution.squares.cast<int>();
-    to->products += contribution.products.cast<int>();
-    to->sum += contribution.sum.cast<int>();
-  };
+  if (!kWithdraw) own = {Eigen::Array4i::Zero(), Eigen::Array4i::Zero(), Eigen::Array4i::Zero()};
   masks_[home].anchored &= ~(std::uint64_t{1} << cell);  // not a neighbour of its own
 
   // Blocks lie anywhere in memory: each pass fetches what the next one reads, so that the fetches overlap.
+  const float block_side = static_cast<float>(units_per_cell_) * kSide;
   reached_.clear();
   grid_->ForEachStencilBlock(stencil_, voxel, [&](std::uint32_t slot, const NeighbourStencil::BlockVisit& at) {
     const std::uint64_t cells = masks_[slot].anchored & at.cells;
     if (cells == 0) return true;
-    for (std::uint64_t rest = cells; rest != 0; rest &= rest - 1) __builtin_prefetch(&blocks_[slot].anchors[__builtin_ctzll(rest)]);
-    const Eigen::Array4i offset(at.offset[0], at.offset[1], at.offset[2], 0);
-    reached_.push_back({(offset * (kSide * units_per_cell_)).cast<float>(), cells, slot});
+    for (const auto& axis : blocks_[slot].anchors)
+      for (unsigned layer = 0; layer < kCells; layer += kSide * kSide)
+        if ((cells >> layer & 0xffff) != 0) __builtin_prefetch(&axis[layer]);
+    const Position corner(at.offset[0] * block_side, at.offset[1] * block_side, at.offset[2] * block_side, 0.f);
+    reached_.push_back({corner, slot, cells, 0, 0});
     return true;
   });
-  neighbours_.clear();
+  for (ReachedBlock& reached : reached_) {
+    const Block& other = blocks_[reached.slot];
+    if (kWithdraw) reached.before = CellsWithinRadius(other, reached.cells, before - reached.corner);
+    if (kGive) reached.after = CellsWithinRadius(other, reached.cells, position - reached.corner);
+    for (std::uint64_t cells = reached.before | reached.after; cells != 0; cells &= cells - 1)
+      __builtin_prefetch(&other.moments[__builtin_ctzll(cells)], 1);
+  }
   for (const ReachedBlock& reached : reached_) {
     Block& other = blocks_[reached.slot];
     const Position before_there = before - reached.corner, position_there = position - reached.corner;
-    std::uint64_t changed = 0;
-    for (std::uint64_t cells = reached.cells; cells != 0; cells &= cells - 1) {
+    for (std::uint64_t cells = reached.before; kWithdraw && cells != 0; cells &= cells - 1) {
       const unsigned neighbour = static_cast<unsigned>(__builtin_ctzll(cells));
-      const Position& anchor = other.anchors[neighbour];
-      const bool was_near = kWithdraw && (anchor - before_there).matrix().squaredNorm() <= radius2_units_;
-      const bool is_near = kGive && (anchor - position_there).matrix().squaredNorm() <= radius2_units_;
-      if (!was_near && !is_near) continue;
-      changed |= cells & -cells;
-      __builtin_prefetch(&other.moments[neighbour].squares, 1);
-      __builtin_prefetch(&other.moments[neighbour].sum, 1);
-      neighbours_.push_back({reached.corner + cell_centers_[neighbour], &other.moments[neighbour], was_near, is_near});
-      if (!kGive || was_near == is_near) continue;
-      Contribution theirs;
-      is_near ? theirs.Add(anchor + reached.corner - center) : theirs.Subtract(anchor + reached.corner - center);
-      give(theirs, &own);
+      Accumulate<-1>(before_there - cell_centers_[neighbour], &other.moments[neighbour]);
     }
-    masks_[reached.slot].stale |= changed;
-  }
-  for (const Neighbour& neighbour : neighbours_) {
-    Contribution change;
-    if (neighbour.is_near) change.Add(position - neighbour.center);
-    if (neighbour.was_near) change.Subtract(before - neighbour.center);
-    give(change, neighbour.moments);
+    for (std::uint64_t cells = reached.after; kGive && cells != 0; cells &= cells - 1) {
+      const unsigned neighbour = static_cast<unsigned>(__builtin_ctzll(cells));
+      Accumulate<1>(position_there - cell_centers_[neighbour], &other.moments[neighbour]);
+    }
+    masks_[reached.slot].stale |= reached.before | reached.after;
+    const Position from_there = reached.corner - center;
+    const auto theirs = [&](std::uint64_t cells) { return other.Anchor(static_cast<unsigned>(__builtin_ctzll(cells))) + from_there; };
+    for (std::uint64_t won = reached.after & ~reached.before; kGive && won != 0; won &= won - 1) Accumulate<1>(theirs(won), &own);
+    for (std::uint64_t lost = reached.before & ~reached.after; kGive && lost != 0; lost &= lost - 1) Accumulate<-1>(theirs(lost), &own);
   }
 
   if (!kGive) return;
-  Contribution change;
-  change.Add(position - center);
-  if (kWithdraw) change.Subtract(before - center);
-  give(change, &own);
+  if (kWithdraw) Accumulate<-1>(before - center, &own);
+  Accumulate<1>(position - center, &own);
   blocks_[home].moments[cell] = own;
-  blocks_[home].anchors[cell] = position;
+  for (int axis = 0; axis < 3; ++axis) blocks_[home].anchors[axis][cell] = position.xyz1[axis];
   masks_[home].anchored |= std::uint64_t{1} << cell;
   masks_[home].stale |= std::uint64_t{1} << cell;
 }
@@ -278,7 +290,7 @@ NormalAccumulators IncrementalNormals::Accumulators(VoxelHandle voxel) const {
 
 Eigen::Vector3i IncrementalNormals::Anchor(VoxelHandle voxel) const {
   MomentsOf(voxel);  // throws if there is none
-  return (blocks_[voxel / kCells].anchors[voxel % kCells] - cell_centers_[voxel % kCells]).head<3>().cast<int>();
+  return (blocks_[voxel / kCells].Anchor(voxel % kCells) - cell_centers_[voxel % kCells]).xyz1.head<3>().cast<int>();
 }
 
 }  // namespace incremental_segmatch

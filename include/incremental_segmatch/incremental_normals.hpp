@@ -95,37 +95,49 @@ class IncrementalNormals {
   std::size_t memory_bytes() const { return blocks_.memory_bytes() + masks_.capacity() * sizeof(Masks); }
 
  private:
-  // (x, y, z, 1) in units, integers throughout. Anchors are relative to their block's corner, accumulators to their
-  // cell's centre.
-  using Position = Eigen::Array4f;
+  // Positions are in units, integers throughout. Anchors are relative to their block's corner, accumulators to their cell's centre.
+  using Lanes = Eigen::Array4f;
+  /// A position as (x, y, z, 1) and as (y, z, x, 1): their products with themselves and each other are what the accumulators sum.
+  struct Position {
+    Lanes xyz1, yzx1;
+
+    Position(float x, float y, float z, float one = 1.f) : xyz1(x, y, z, one), yzx1(y, z, x, one) {}
+    Position() : Position(0.f, 0.f, 0.f, 0.f) {}
+    Position(const Lanes& a, const Lanes& b) : xyz1(a), yzx1(b) {}
+    Position operator-(const Position& other) const { return {xyz1 - other.xyz1, yzx1 - other.yzx1}; }
+    Position operator+(const Position& other) const { return {xyz1 + other.xyz1, yzx1 + other.yzx1}; }
+  };
   struct Moments {
     Eigen::Array4i squares;   // sums of x x, y y, z z, 1
     Eigen::Array4i products;  // sums of x y, y z, z x, 1
     Eigen::Array4i sum;       // sums of x, y, z, 1
   };
   struct Block {
-    std::array<Position, DynamicVoxelGrid::kCellsPerBlock> anchors;
+    std::array<std::array<float, DynamicVoxelGrid::kCellsPerBlock>, 3> anchors;  // x, y, z: rows of four cells at a time
     std::array<Moments, DynamicVoxelGrid::kCellsPerBlock> moments;
     mutable std::array<NormalEstimate, DynamicVoxelGrid::kCellsPerBlock> estimates;
+
+    Position Anchor(unsigned cell) const { return {anchors[0][cell], anchors[1][cell], anchors[2][cell]}; }
   };
   struct Masks {
     std::uint64_t anchored = 0;       // cells whose voxels have given their contribution
     mutable std::uint64_t stale = 0;  // cells whose estimate is older than their accumulators
   };
-  // Work space of Replace; positions are relative to the corner of the voxel's block.
+  // A block around the voxel of Replace.
   struct ReachedBlock {
-    Position corner;
-    std::uint64_t cells;
+    Position corner;       // relative to the corner of the voxel's block
     std::uint32_t slot;
+    std::uint64_t cells;   // that may hold neighbours
+    std::uint64_t before;  // that hold neighbours of its anchor
+    std::uint64_t after;   // that hold neighbours of its new position
   };
-  struct Neighbour {
-    Position center;
-    Moments* moments;
-    bool was_near, is_near;
-  };
+
   bool IsAnchored(VoxelHandle voxel) const;
   const Moments& MomentsOf(VoxelHandle voxel) const;
   Position PositionOf(VoxelHandle voxel, const Eigen::Vector3f& in_block) const;
+  std::uint64_t CellsWithinRadius(const Block& block, std::uint64_t cells, const Position& position) const;
+  template <int kSign>
+  static void Accumulate(const Position& p, Moments* moments);
   template <bool kWithdraw, bool kGive>
   void Replace(VoxelHandle voxel, const Position& position);
   Eigen::Matrix3d CovarianceOf(const Moments& moments) const;
@@ -137,12 +149,11 @@ class IncrementalNormals {
   double unit_m_ = 0.0;
   int units_per_cell_ = 0;
   float units_per_m_ = 0.f;
-  std::array<Position, DynamicVoxelGrid::kCellsPerBlock> cell_centers_;  // (x, y, z, 0) relative to the block's corner
+  std::array<Position, DynamicVoxelGrid::kCellsPerBlock> cell_centers_;  // relative to the block's corner; last lane 0
   float radius2_units_ = 0.f;
   float tolerance2_units_ = 0.f;
   PagedArray<Block> blocks_;
-  std::vector<ReachedBlock> reached_;
-  std::vector<Neighbour> neighbours_;
+  std::vector<ReachedBlock> reached_;                   // work space of Replace
   std::vector<VoxelHandle> renewing_, leaving_;  // work space of Insert and Remove
   std::vector<Masks> masks_;  // apart from the blocks, since most blocks around a voxel have nothing in reach
 };
