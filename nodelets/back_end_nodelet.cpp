@@ -64,7 +64,7 @@ void BackEndNodelet::Start() {
   parameters_ = parameters.node;
   core_parameters_ = parameters.core.back_end;
 
-  closures_publisher_ = nh.advertise<LoopClosureMsg>("loop_closures", 100);
+  closures_publisher_ = nh.advertise<LoopClosure>("loop_closures", 100);
   targets_publisher_ = nh.advertise<sensor_msgs::PointCloud2>("target_segments", 1);
   candidates_publisher_ = nh.advertise<visualization_msgs::Marker>("candidate_matches", 1);
   accepted_publisher_ = nh.advertise<visualization_msgs::Marker>("accepted_matches", 1);
@@ -235,7 +235,7 @@ void BackEndNodelet::CorrectTrajectory(const std::string& robot_name, const nav_
 
 void BackEndNodelet::Publish(const BackEndStep& step, const SegmentDelta& delta, Robot& robot) {
   if (step.closure) {
-    const LoopClosure& closure = *step.closure;
+    const Closure& closure = *step.closure;
     robot.T_map_odom = closure.T_map_odom;
     closures_.push_back({closure.robot_query, closure.stamp_query_ns, closure.robot_target, closure.stamp_target_ns});
     if (closure_log_) closure_log_->Add(closure);
@@ -257,14 +257,14 @@ void BackEndNodelet::Publish(const BackEndStep& step, const SegmentDelta& delta,
   }
 }
 
-bool BackEndNodelet::IsDue(const LoopClosure& closure, const Robot& robot) const {
+bool BackEndNodelet::IsDue(const Closure& closure, const Robot& robot) const {
   if (!robot.published_path_m) return true;
   const double interval_s = 1e-9 * static_cast<double>(closure.stamp_query_ns - robot.published_ns);
   return robot.path_m - *robot.published_path_m >= parameters_.closure_min_distance_m &&
          interval_s >= parameters_.closure_min_interval_s;
 }
 
-void BackEndNodelet::PublishClosure(const LoopClosure& closure, Robot& robot) {
+void BackEndNodelet::PublishClosure(const Closure& closure, Robot& robot) {
   const auto target = robots_.find(closure.robot_target);
   FrameKind kind = parameters_.closure_kind;
   RobotFrames target_frames;
@@ -278,13 +278,13 @@ void BackEndNodelet::PublishClosure(const LoopClosure& closure, Robot& robot) {
   }
   robot.published_path_m = robot.path_m;
   robot.published_ns = closure.stamp_query_ns;
-  closures_publisher_.publish(boost::make_shared<const LoopClosureMsg>(
-      ToLoopClosureMsg(closure, kind, robot.frames, target_frames, back_end_->map())));
+  closures_publisher_.publish(boost::make_shared<const LoopClosure>(
+      ToLoopClosure(closure, kind, robot.frames, target_frames, back_end_->map())));
   const std::lock_guard<std::mutex> lock(mutex_);
   ++status_.published;
 }
 
-void BackEndNodelet::PublishLocalization(const LoopClosure& closure, const SegmentDelta& delta, const Robot& robot) {
+void BackEndNodelet::PublishLocalization(const Closure& closure, const SegmentDelta& delta, const Robot& robot) {
   const Pose T_sensor_base = robot.frames.T_base_sensor.inverse();
   const Pose T_map_base = closure.T_map_odom * delta.T_odom_sensor * T_sensor_base;
   const Covariance6 covariance = MoveRightPerturbation(closure.covariance, T_sensor_base);

@@ -94,9 +94,9 @@ class BackEndNodelet : public nodelet::Nodelet {
   void RequestFullState(const std::string& topic);
   void CorrectTrajectory(const std::string& robot, const nav_msgs::Path& path);
   void Publish(const BackEndStep& step, const SegmentDelta& delta, Robot& robot);
-  bool IsDue(const LoopClosure& closure, const Robot& robot) const;
-  void PublishClosure(const LoopClosure& closure, Robot& robot);
-  void PublishLocalization(const LoopClosure& closure, const SegmentDelta& delta, const Robot& robot);
+  bool IsDue(const Closure& closure, const Robot& robot) const;
+  void PublishClosure(const Closure& closure, Robot& robot);
+  void PublishLocalization(const Closure& closure, const SegmentDelta& delta, const Robot& robot);
   void PublishTransform(const SegmentDelta& delta, const Robot& robot);
   void PublishMatches(const BackEndStep& step, const SegmentDelta& delta, const Robot& robot);
   void PublishMap(const ros::Time& stamp);

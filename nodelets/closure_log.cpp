@@ -12,7 +12,7 @@ ClosureLog::ClosureLog(const std::string& path) : path_(path), file_(path) {
   if (!file_) throw std::runtime_error("can't write " + path_ + ": does its folder exist, and may it be written?");
 }
 
-void ClosureLog::Add(const LoopClosure& closure) {
+void ClosureLog::Add(const Closure& closure) {
   const Eigen::Vector3d t = closure.T_target_query.translation();
   const Eigen::Quaterniond q = Eigen::Quaterniond(closure.T_target_query.linear()).normalized();
   file_ << FormatSeconds(closure.stamp_query_ns) << ',' << FormatSeconds(closure.stamp_target_ns) << ','

@@ -17,7 +17,7 @@ class ClosureLog {
   explicit ClosureLog(const std::string& path);
 
   /// Throws std::runtime_error naming the file if it can't be written.
-  void Add(const LoopClosure& closure);
+  void Add(const Closure& closure);
 
  private:
   std::string path_;

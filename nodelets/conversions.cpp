@@ -260,9 +260,9 @@ RobotFrames ToRobotFrames(const SegmentArray& message) {
           ToPose(message.sensor_in_base, "sensor_in_base")};
 }
 
-LoopClosureMsg ToLoopClosureMsg(const LoopClosure& closure, FrameKind frame_kind, const RobotFrames& query,
-                                const RobotFrames& target, const TargetMap& map) {
-  LoopClosureMsg message;
+LoopClosure ToLoopClosure(const Closure& closure, FrameKind frame_kind, const RobotFrames& query,
+                          const RobotFrames& target, const TargetMap& map) {
+  LoopClosure message;
   message.header.stamp = ToTime(closure.stamp_query_ns);
   message.header.frame_id = query.odom_frame;
   message.robot_query = closure.robot_query;
@@ -271,13 +271,13 @@ LoopClosureMsg ToLoopClosureMsg(const LoopClosure& closure, FrameKind frame_kind
   message.stamp_target = ToTime(closure.stamp_target_ns);
   if (frame_kind == FrameKind::kBase) {
     const Pose T_sensor_base = query.T_base_sensor.inverse();
-    message.frame_kind = LoopClosureMsg::FRAME_BASE;
+    message.frame_kind = LoopClosure::FRAME_BASE;
     message.frame_query = query.base_frame;
     message.frame_target = target.base_frame;
     message.relative_pose = ToPoseWithCovariance(target.T_base_sensor * closure.T_target_query * T_sensor_base,
                                                  MoveRightPerturbation(closure.covariance, T_sensor_base));
   } else {
-    message.frame_kind = LoopClosureMsg::FRAME_SENSOR;
+    message.frame_kind = LoopClosure::FRAME_SENSOR;
     message.frame_query = query.sensor_frame;
     message.frame_target = target.sensor_frame;
     message.relative_pose = ToPoseWithCovariance(closure.T_target_query, closure.covariance);
@@ -297,11 +297,11 @@ LoopClosureMsg ToLoopClosureMsg(const LoopClosure& closure, FrameKind frame_kind
   return message;
 }
 
-SensorClosure ToSensorClosure(const LoopClosureMsg& message, const RobotFrames& query, const RobotFrames& target) {
+SensorClosure ToSensorClosure(const LoopClosure& message, const RobotFrames& query, const RobotFrames& target) {
   const Pose T = ToPose(message.relative_pose.pose, "relative_pose");
   const Covariance6 covariance = ToCovariance(message.relative_pose);
-  if (message.frame_kind == LoopClosureMsg::FRAME_SENSOR) return {T, covariance};
-  if (message.frame_kind != LoopClosureMsg::FRAME_BASE)
+  if (message.frame_kind == LoopClosure::FRAME_SENSOR) return {T, covariance};
+  if (message.frame_kind != LoopClosure::FRAME_BASE)
     throw std::invalid_argument("loop closure with the unknown frame_kind " + std::to_string(message.frame_kind));
   return {target.T_base_sensor.inverse() * T * query.T_base_sensor,
           MoveRightPerturbation(covariance, query.T_base_sensor)};

@@ -7,6 +7,9 @@
 #include <geometry_msgs/Pose.h>
 #include <geometry_msgs/PoseWithCovariance.h>
 #include <geometry_msgs/TransformStamped.h>
+#include <incremental_segmatch/LoopClosure.h>
+#include <incremental_segmatch/SegmentArray.h>
+#include <incremental_segmatch/StepReport.h>
 #include <nav_msgs/Path.h>
 #include <ros/time.h>
 
@@ -18,7 +21,6 @@
 #include "incremental_segmatch/segment_delta.hpp"
 #include "incremental_segmatch/stage_times.hpp"
 #include "incremental_segmatch/types.hpp"
-#include "messages.hpp"
 
 namespace incremental_segmatch {
 
@@ -71,8 +73,8 @@ SegmentDelta ToSegmentDelta(const SegmentArray& message, const std::string& robo
 RobotFrames ToRobotFrames(const SegmentArray& message);
 
 /// A closure as a message, between base frames or between the sensors. `map` names the robots of its matches.
-LoopClosureMsg ToLoopClosureMsg(const LoopClosure& closure, FrameKind frame_kind, const RobotFrames& query,
-                                const RobotFrames& target, const TargetMap& map);
+LoopClosure ToLoopClosure(const Closure& closure, FrameKind frame_kind, const RobotFrames& query,
+                          const RobotFrames& target, const TargetMap& map);
 
 /// What a pose graph over sensor poses takes of a closure.
 struct SensorClosure {
@@ -81,7 +83,7 @@ struct SensorClosure {
 };
 
 /// A closure's relative pose between the two sensors. `query` and `target` give T_base_sensor.
-SensorClosure ToSensorClosure(const LoopClosureMsg& message, const RobotFrames& query, const RobotFrames& target);
+SensorClosure ToSensorClosure(const LoopClosure& message, const RobotFrames& query, const RobotFrames& target);
 
 /// A trajectory of sensor poses as a path of base or sensor poses in `frame`.
 nav_msgs::Path ToPath(const std::vector<StampedPose>& trajectory, FrameKind frame_kind, const RobotFrames& robot,

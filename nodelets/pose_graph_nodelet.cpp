@@ -54,15 +54,14 @@ void PoseGraphNodelet::Start() {
   write_service_ = nh.advertiseService("write_trajectories", &PoseGraphNodelet::OnWrite, this);
   if (parameters_.robots.empty()) Subscribe("");
   for (const std::string& robot : parameters_.robots) Subscribe(robot);
-  const boost::function<void(const LoopClosureMsgConstPtr&)> on_closure =
-      [this](const LoopClosureMsgConstPtr& closure) {
-        worker_->PostAlways([this, closure] {
-          waiting_closures_.push_back(closure);
-          AddWaitingClosures();
-          OptimizeIfIdle();
-        });
-      };
-  subscribers_.push_back(nh.subscribe<LoopClosureMsg>("loop_closures", 100, on_closure));
+  const boost::function<void(const LoopClosureConstPtr&)> on_closure = [this](const LoopClosureConstPtr& closure) {
+    worker_->PostAlways([this, closure] {
+      waiting_closures_.push_back(closure);
+      AddWaitingClosures();
+      OptimizeIfIdle();
+    });
+  };
+  subscribers_.push_back(nh.subscribe<LoopClosure>("loop_closures", 100, on_closure));
 
   diagnostics_ = std::make_unique<diagnostic_updater::Updater>(nh, getPrivateNodeHandle(), getName());
   diagnostics_->setHardwareID("none");
@@ -137,7 +136,7 @@ void PoseGraphNodelet::AddPose(const SegmentArray& message, const std::string& p
 }
 
 /// True if the closure was taken; false if it must wait for the query's pose.
-bool PoseGraphNodelet::AddClosure(const LoopClosureMsg& message) {
+bool PoseGraphNodelet::AddClosure(const LoopClosure& message) {
   const auto query = robots_.find(message.robot_query);
   if (query == robots_.end() || query->second.odometry.back().stamp_ns < ToStampNs(message.stamp_query)) return false;
   const auto target = robots_.find(message.robot_target);
@@ -158,9 +157,9 @@ bool PoseGraphNodelet::AddClosure(const LoopClosureMsg& message) {
 }
 
 void PoseGraphNodelet::AddWaitingClosures() {
-  std::vector<LoopClosureMsgConstPtr> waiting;
+  std::vector<LoopClosureConstPtr> waiting;
   waiting.swap(waiting_closures_);
-  for (const LoopClosureMsgConstPtr& closure : waiting)
+  for (const LoopClosureConstPtr& closure : waiting)
     if (!AddClosure(*closure)) waiting_closures_.push_back(closure);
 }
 

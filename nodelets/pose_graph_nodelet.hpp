@@ -73,7 +73,7 @@ class PoseGraphNodelet : public nodelet::Nodelet {
   // In the worker's thread.
   void AddPose(const SegmentArray& message, const std::string& prefix);
   void StartOver();
-  bool AddClosure(const LoopClosureMsg& message);
+  bool AddClosure(const LoopClosure& message);
   void AddWaitingClosures();
   void OptimizeIfIdle();
   void Optimize();
@@ -100,9 +100,9 @@ class PoseGraphNodelet : public nodelet::Nodelet {
   // Owned by the worker's thread.
   std::unique_ptr<PoseGraph> graph_;
   RobotSessions sessions_;
-  std::map<std::string, Robot> robots_;                   // by session
-  std::map<std::string, std::string> newest_session_;     // by prefix
-  std::vector<LoopClosureMsgConstPtr> waiting_closures_;  // for the query's pose
+  std::map<std::string, Robot> robots_;                // by session
+  std::map<std::string, std::string> newest_session_;  // by prefix
+  std::vector<LoopClosureConstPtr> waiting_closures_;  // for the query's pose
   bool has_new_closures_ = false;
 
   std::unique_ptr<Worker> worker_;  // last: its thread ends before anything else goes

@@ -370,7 +370,7 @@ const SegmentView& BackEnd::MatchedView(RobotIndex robot, const Correspondence& 
 }
 
 /// Refines a recognition on points, gathers the evidence for it and judges that. `counts` gets the evidence and the end.
-std::optional<LoopClosure> BackEnd::Verify(RobotIndex robot, StampNs stamp_ns, const RecognizerResult& result,
+std::optional<Closure> BackEnd::Verify(RobotIndex robot, StampNs stamp_ns, const RecognizerResult& result,
                                            BackEndCounts* counts) const {
   Recognition recognition = *result.recognition;
   Evidence evidence;
@@ -386,7 +386,7 @@ std::optional<LoopClosure> BackEnd::Verify(RobotIndex robot, StampNs stamp_ns, c
     recognition.covariance = refined->covariance;
     evidence.overlap = refined->overlap;
   }
-  std::optional<LoopClosure> closure = MakeClosure(robot, stamp_ns, recognition);
+  std::optional<Closure> closure = MakeClosure(robot, stamp_ns, recognition);
   if (!closure) {
     counts->end = StepEnd::kTooYoung;
     return std::nullopt;
@@ -439,7 +439,7 @@ std::optional<RefinedTransform> BackEnd::Refine(RobotIndex robot, const Recognit
 }
 
 /// The closure to the nearest of the poses that the matched views were seen from. None if all of them are too young.
-std::optional<LoopClosure> BackEnd::MakeClosure(RobotIndex robot, StampNs stamp_ns, const Recognition& recognition) const {
+std::optional<Closure> BackEnd::MakeClosure(RobotIndex robot, StampNs stamp_ns, const Recognition& recognition) const {
   const Pose T_map_query = recognition.T_target_local * robots_[robot].T_odom_sensor;
   const SegmentView* nearest = nullptr;
   double nearest_m = std::numeric_limits<double>::infinity();
@@ -459,7 +459,7 @@ std::optional<LoopClosure> BackEnd::MakeClosure(RobotIndex robot, StampNs stamp_
   if (nearest == nullptr) return std::nullopt;
 
   const TrajectoryPose& target = map_.PoseOf(*nearest);
-  LoopClosure closure;
+  Closure closure;
   closure.stamp_query_ns = stamp_ns;
   closure.stamp_target_ns = target.stamp_ns;
   closure.robot_query = robots_[robot].name;
@@ -475,7 +475,7 @@ std::optional<LoopClosure> BackEnd::MakeClosure(RobotIndex robot, StampNs stamp_
 }
 
 /// What was recognised is the same: remembered until the local segment's tracking ends.
-void BackEnd::AcceptClosure(RobotIndex robot, const LoopClosure& closure) {
+void BackEnd::AcceptClosure(RobotIndex robot, const Closure& closure) {
   if (!IsLoopClosure()) return;
   for (const SegmentMatch& match : closure.matches) robots_[robot].local.at(match.local.id).same_as = match.target;
   const RobotIndex target_robot = closure.matches.front().target.robot;

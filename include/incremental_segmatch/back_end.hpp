@@ -61,7 +61,7 @@ struct SegmentMatch {
 };
 
 /// Relative pose of two sensor poses: what every pose graph takes.
-struct LoopClosure {
+struct Closure {
   StampNs stamp_query_ns = 0;              ///< of the newer pose: the scan that recognised the place
   StampNs stamp_target_ns = 0;             ///< of the older pose, from which matched segments were seen
   std::string robot_query;                 ///< whose scan it was
@@ -113,8 +113,8 @@ struct BackEndCounts {
 
 /// What came of one delta.
 struct BackEndStep {
-  std::optional<LoopClosure> closure;  ///< the place, if one was recognised
-  bool missed_delta = false;           ///< a delta is missing: ask the robot for a full state; this one was not applied
+  std::optional<Closure> closure;  ///< the place, if one was recognised
+  bool missed_delta = false;       ///< a delta is missing: ask the robot for a full state; this one was not applied
   std::vector<SegmentMatch> candidates;  ///< all that entered recognition
   BackEndCounts counts;                  ///< the funnel
   StageTimes times;                      ///< of this step
@@ -184,12 +184,12 @@ class BackEnd {
   std::map<RobotIndex, Correspondences> CollectCorrespondences(RobotIndex robot) const;
   RecognizerResult Recognize(RobotIndex robot, const std::map<RobotIndex, Correspondences>& by_frame);
   const SegmentView& MatchedView(RobotIndex robot, const Correspondence& inlier) const;
-  std::optional<LoopClosure> Verify(RobotIndex robot, StampNs stamp_ns, const RecognizerResult& result,
-                                    BackEndCounts* counts) const;
+  std::optional<Closure> Verify(RobotIndex robot, StampNs stamp_ns, const RecognizerResult& result,
+                                BackEndCounts* counts) const;
   std::optional<RefinedTransform> Refine(RobotIndex robot, const Recognition& recognition) const;
   void MeasureCoverage(RobotIndex robot, const Pose& T_map_odom, Evidence* evidence) const;
-  std::optional<LoopClosure> MakeClosure(RobotIndex robot, StampNs stamp_ns, const Recognition& recognition) const;
-  void AcceptClosure(RobotIndex robot, const LoopClosure& closure);
+  std::optional<Closure> MakeClosure(RobotIndex robot, StampNs stamp_ns, const Recognition& recognition) const;
+  void AcceptClosure(RobotIndex robot, const Closure& closure);
   void JoinFrames(RobotIndex robot, RobotIndex target_robot, const Pose& T_map_odom);
 
   BackEndParameters parameters_;

@@ -21,7 +21,7 @@ class Stopwatch {
   std::chrono::steady_clock::time_point start_ = std::chrono::steady_clock::now();
 };
 
-ClosureRow ToRow(const LoopClosure& closure) {
+ClosureRow ToRow(const Closure& closure) {
   return {closure.stamp_query_ns, closure.stamp_target_ns, closure.robot_query, closure.robot_target,
           closure.T_target_query, closure.inliers,         closure.candidates,  closure.rms_m};
 }
@@ -47,7 +47,7 @@ class LoopCloser {
   }
 
   // True if the closure entered the graph.
-  bool AddClosure(const LoopClosure& closure) {
+  bool AddClosure(const Closure& closure) {
     if (travelled_m_ - last_closure_m_ < parameters_.closure_spacing_m) return false;
     if (!graph_.AddClosure(kRobot, closure.stamp_target_ns, kRobot, closure.stamp_query_ns, closure.T_target_query,
                            closure.covariance)) {

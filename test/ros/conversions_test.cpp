@@ -153,7 +153,7 @@ TEST(Conversions, ClosureBetweenBasesIsTheSameClosure) {
     map.RobotByName("bob");
     const Pose T_world_target_sensor = RandomPose(random, 100.0);
     const Pose T_world_query_sensor = RandomPose(random, 100.0);
-    LoopClosure closure;
+    Closure closure;
     closure.stamp_query_ns = 1317000100000000001;
     closure.stamp_target_ns = 1317000000000000002;
     closure.robot_query = "alice";
@@ -165,7 +165,7 @@ TEST(Conversions, ClosureBetweenBasesIsTheSameClosure) {
     closure.rms_m = 0.125;
     closure.matches = {{{0, 11}, {1, 22}, {1, 2, 3}, {4, 5, 6}}};
 
-    const LoopClosureMsg message = ToLoopClosureMsg(closure, FrameKind::kBase, query, target, map);
+    const LoopClosure message = ToLoopClosure(closure, FrameKind::kBase, query, target, map);
     EXPECT_EQ(message.frame_query, "q/base_link");
     EXPECT_EQ(message.frame_target, "t/base_link");
     const Pose T_world_target_base = T_world_target_sensor * target.T_base_sensor.inverse();
@@ -180,7 +180,7 @@ TEST(Conversions, ClosureBetweenBasesIsTheSameClosure) {
     EXPECT_EQ(ToStampNs(message.stamp_target), closure.stamp_target_ns);
 
     for (const FrameKind kind : {FrameKind::kBase, FrameKind::kSensor}) {
-      const SensorClosure back = ToSensorClosure(ToLoopClosureMsg(closure, kind, query, target, map), query, target);
+      const SensorClosure back = ToSensorClosure(ToLoopClosure(closure, kind, query, target, map), query, target);
       ExpectSamePoses(back.T_target_query, closure.T_target_query);
       EXPECT_LT((back.covariance - closure.covariance).cwiseAbs().maxCoeff(), 1e-9);
     }

@@ -51,8 +51,8 @@ class Driver {
     steps_ = nh_.subscribe<StepReport>("back_end_steps", 10, [this](const StepReportConstPtr&) { ++answered_; });
     local_ = nh_.subscribe<sensor_msgs::PointCloud2>(
         "local_cloud", 1, [this](const sensor_msgs::PointCloud2ConstPtr& m) { local_cloud_points_ = m->width; });
-    closures_ = nh_.subscribe<LoopClosureMsg>("loop_closures", 100,
-                                              [this](const LoopClosureMsgConstPtr& m) { received_.push_back(*m); });
+    closures_ = nh_.subscribe<LoopClosure>("loop_closures", 100,
+                                           [this](const LoopClosureConstPtr& m) { received_.push_back(*m); });
     paths_ = nh_.subscribe<nav_msgs::Path>("trajectory", 1, [this](const nav_msgs::PathConstPtr& m) { path_ = *m; });
     static_broadcaster_.sendTransform(ToTransform(BaseToSensor(), "base_link", "velodyne", ros::Time::now()));
   }
@@ -73,7 +73,7 @@ class Driver {
   }
 
   const SyntheticDrive& drive() const { return drive_; }
-  const std::vector<LoopClosureMsg>& received() const { return received_; }
+  const std::vector<LoopClosure>& received() const { return received_; }
   const nav_msgs::Path& path() const { return path_; }
   std::size_t local_cloud_points() const { return local_cloud_points_; }
 
@@ -86,7 +86,7 @@ class Driver {
   tf2_ros::StaticTransformBroadcaster static_broadcaster_;
   std::size_t answered_ = 0;
   std::size_t local_cloud_points_ = 0;
-  std::vector<LoopClosureMsg> received_;
+  std::vector<LoopClosure> received_;
   nav_msgs::Path path_;
 };
 
@@ -109,14 +109,14 @@ TEST_F(Pipeline, ClosesTheLoopAndCorrectsTheTrajectory) {
   EXPECT_GT(driver.local_cloud_points(), 1000u);
 
   // Closures are right, between base frames, and no more frequent than one in five metres.
-  const std::vector<LoopClosureMsg>& closures = driver.received();
+  const std::vector<LoopClosure>& closures = driver.received();
   ASSERT_GE(closures.size(), 3u);
   EXPECT_LE(closures.size(), 40u);
   const auto scan_at = [](const ros::Time& stamp) {
     return static_cast<int>((ToStampNs(stamp) - SyntheticDrive::kStartNs) / SyntheticDrive::kPeriodNs);
   };
-  for (const LoopClosureMsg& closure : closures) {
-    EXPECT_EQ(closure.frame_kind, LoopClosureMsg::FRAME_BASE);
+  for (const LoopClosure& closure : closures) {
+    EXPECT_EQ(closure.frame_kind, LoopClosure::FRAME_BASE);
     EXPECT_EQ(closure.frame_query, "base_link");
     EXPECT_EQ(closure.robot_query, "alice");
     EXPECT_EQ(closure.robot_target, "alice");

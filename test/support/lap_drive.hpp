@@ -58,7 +58,7 @@ inline PipelineRun Process(const Drive& drive, BackEnd* back_end, const FrontEnd
     if (i >= moved_from) scan.T_odom_sensor = T_moved_odom * scan.T_odom_sensor;
     BackEndStep step = back_end->Process(front_end.Process(scan).delta);
     if (step.closure) {
-      const LoopClosure& c = *step.closure;
+      const Closure& c = *step.closure;
       run.closures.push_back({c.stamp_query_ns, c.stamp_target_ns, c.robot_query, c.robot_target, c.T_target_query, c.inliers,
                               c.candidates, c.rms_m});
     }
