@@ -24,7 +24,7 @@ struct EvaluateArguments {
   KittiDriveOptions kitti;
   BagDriveOptions bag;
   bool simulate = false;
-  simulator::SimulationOptions simulation;
+  SimulationArguments simulation;
   std::string config;
   std::string out;
   unsigned kidnap_seed = 0;
@@ -43,7 +43,7 @@ std::unique_ptr<DriveSource> OpenBagDrive(const BagDriveOptions&) {
 #endif
 
 std::unique_ptr<DriveSource> OpenDrive(const EvaluateArguments& arguments) {
-  if (arguments.simulate) return std::make_unique<SimulatedDrive>(arguments.simulation);
+  if (arguments.simulate) return std::make_unique<SimulatedDrive>(arguments.simulation.Resolve());
   if (!arguments.bag.path.empty()) return OpenBagDrive(arguments.bag);
   return std::make_unique<KittiDrive>(arguments.kitti);
 }
@@ -107,28 +107,10 @@ void AddInputOptions(CLI::App& command, EvaluateArguments& arguments) {
       ->capture_default_str()
       ->needs(bag);
 
-  CLI::App* with_simulate = command.add_option_group("With --simulate", "see segmatch simulate --help");
-  simulator::SimulationOptions& simulation = arguments.simulation;
-  CLI::Option* route = with_simulate->add_option("--route", simulation.route, "preset route");
-  route->check(CLI::IsMember(simulator::PresetRouteNames()))->capture_default_str()->needs(simulate);
-  with_simulate->add_option("--poses", simulation.poses_file, "drive along this KITTI pose file")
-      ->check(CLI::ExistingFile)
-      ->excludes(route)
-      ->needs(simulate);
-  with_simulate->add_option("--sensor", simulation.sensor, "LiDAR")
-      ->check(CLI::IsMember(simulator::SensorNames()))
-      ->capture_default_str()
-      ->needs(simulate);
-  with_simulate->add_option("--seed", simulation.seed, "of town, noise and drift")
-      ->capture_default_str()
-      ->needs(simulate);
-  with_simulate->add_option("--day", simulation.day, "another day in the same town")
-      ->capture_default_str()
-      ->needs(simulate);
-  with_simulate->add_option("--stride", simulation.stride, "keep every n-th frame")
-      ->check(CLI::PositiveNumber)
-      ->capture_default_str()
-      ->needs(simulate);
+  CLI::App* with_simulate = command.add_option_group("With --simulate");
+  AddRouteOptions(*with_simulate, &arguments.simulation);
+  AddSimulationOptions(*with_simulate, &arguments.simulation);
+  for (CLI::Option* option : with_simulate->get_options()) option->needs(simulate);
 }
 
 }  // namespace

@@ -5,6 +5,7 @@
 #include <optional>
 #include <string>
 
+#include "apps/simulation_options.hpp"
 #include "evaluation/drive_source.hpp"
 #include "simulator/simulation.hpp"
 
@@ -16,8 +17,8 @@ class SimulatedDrive : public DriveSource {
   /// Throws what simulator::Simulation throws.
   explicit SimulatedDrive(const simulator::SimulationOptions& options)
       : simulation_(options),
-        name_("simulated drive along " + (options.poses_file.empty() ? "route " + options.route : options.poses_file) +
-              ", seed " + std::to_string(options.seed) + ", day " + std::to_string(options.day)) {}
+        name_("simulated drive along " + RouteName(options) + ", seed " + std::to_string(options.seed) + ", day " +
+              std::to_string(options.day)) {}
 
   std::string name() const override { return name_; }
   std::size_t size() const override { return simulation_.size(); }

@@ -131,7 +131,7 @@ class Simulation::Impl {
       throw std::invalid_argument("the route has no frame after the first " + std::to_string(options.first_frame));
   }
 
-  SimulatedScan Scan(std::size_t i) {
+  SimulatedScan Scan(std::size_t i, bool with_intensities) {
     const Pose& pose = truth_.at(i);
     const auto items = town_.ItemsNear(pose.translation().head<2>(), sensor_.max_range_m, town_times_s_[i]);
     const Sweep& sweep = caster_.Cast(pose, items, town_.terrain());
@@ -141,19 +141,22 @@ class Simulation::Impl {
                 min_range = static_cast<float>(sensor_.min_range_m);
     SimulatedScan scan;
     scan.points_sensor.reserve(sweep.range_m.size());
-    scan.intensities.reserve(sweep.range_m.size());
+    if (with_intensities) scan.intensities.reserve(sweep.range_m.size());
     const std::size_t columns = static_cast<std::size_t>(sensor_.columns);
-    for (std::size_t k = 0; k < sweep.range_m.size(); ++k) {
-      if (!(sweep.range_m[k] < max_range)) continue;
-      const std::uint64_t hash = Mix(seed + k);
-      const float cosine = sweep.cos_incidence[k];
-      const float share = sweep.range_m[k] / max_range;
-      if (static_cast<float>(ToUnit(Mix(hash))) < LossOf(sweep.material[k], cosine, share, dropout)) continue;
-      const float range = sweep.range_m[k] + noise * NormalFrom(hash);
-      if (range < min_range) continue;
-      scan.points_sensor.push_back(range * caster_.Direction(k / columns, k % columns));
-      const float shade = Reflectivity(sweep.material[k]) * (0.4f + 0.6f * cosine) * (1.f - 0.3f * share);
-      scan.intensities.push_back(std::clamp(shade + 0.02f * NormalFrom(Mix(hash + 1)), 0.f, 1.f));
+    for (std::size_t ring = 0, k = 0; ring < sensor_.elevations_rad.size(); ++ring) {
+      for (std::size_t column = 0; column < columns; ++column, ++k) {
+        if (!(sweep.range_m[k] < max_range)) continue;
+        const std::uint64_t hash = Mix(seed + k);
+        const float cosine = sweep.cos_incidence[k];
+        const float share = sweep.range_m[k] / max_range;
+        if (static_cast<float>(ToUnit(Mix(hash))) < LossOf(sweep.material[k], cosine, share, dropout)) continue;
+        const float range = sweep.range_m[k] + noise * NormalFrom(hash);
+        if (range < min_range) continue;
+        scan.points_sensor.push_back(range * caster_.Direction(ring, column));
+        if (!with_intensities) continue;
+        const float shade = Reflectivity(sweep.material[k]) * (0.4f + 0.6f * cosine) * (1.f - 0.3f * share);
+        scan.intensities.push_back(std::clamp(shade + 0.02f * NormalFrom(Mix(hash + 1)), 0.f, 1.f));
+      }
     }
     return scan;
   }
@@ -187,10 +190,10 @@ const Pose& Simulation::T_odom_sensor(std::size_t i) const {
   return impl_->odometry_.at(i);
 }
 Points Simulation::Scan(std::size_t i) {
-  return impl_->Scan(i).points_sensor;
+  return impl_->Scan(i, false).points_sensor;
 }
 SimulatedScan Simulation::ScanWithIntensities(std::size_t i) {
-  return impl_->Scan(i);
+  return impl_->Scan(i, true);
 }
 const Town& Simulation::town() const {
   return impl_->town_;

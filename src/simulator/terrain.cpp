@@ -38,6 +38,7 @@ Terrain::Terrain(std::uint64_t seed, const Eigen::Vector2d& low_m, const Eigen::
     : low_m_(low_m), steepest_(std::max(1e-3, 1.5 * grade)) {
   const Eigen::Vector2d size = high_m - low_m;
   spacing_m_ = std::max(4.0, std::sqrt(size.x() * size.y() / kMaxSamples));
+  per_spacing_ = 1.0 / spacing_m_;
   columns_ = std::max(2, static_cast<int>(std::ceil(size.x() / spacing_m_)) + 1);
   rows_ = std::max(2, static_cast<int>(std::ceil(size.y() / spacing_m_)) + 1);
   heights_m_.resize(static_cast<std::size_t>(columns_) * rows_);
@@ -50,17 +51,6 @@ Terrain::Terrain(std::uint64_t seed, const Eigen::Vector2d& low_m, const Eigen::
       heights_m_[static_cast<std::size_t>(row) * columns_ + column] = static_cast<float>(height);
     }
   }
-}
-
-double Terrain::Height(double x_m, double y_m) const {
-  const double u = std::clamp((x_m - low_m_.x()) / spacing_m_, 0.0, columns_ - 1.0);
-  const double v = std::clamp((y_m - low_m_.y()) / spacing_m_, 0.0, rows_ - 1.0);
-  const int column = std::min(static_cast<int>(u), columns_ - 2);
-  const int row = std::min(static_cast<int>(v), rows_ - 2);
-  const double a = u - column;
-  const double b = v - row;
-  const float* h = &heights_m_[static_cast<std::size_t>(row) * columns_ + column];
-  return (1 - b) * ((1 - a) * h[0] + a * h[1]) + b * ((1 - a) * h[columns_] + a * h[columns_ + 1]);
 }
 
 Eigen::Vector3d Terrain::Normal(const Eigen::Vector2d& p) const {

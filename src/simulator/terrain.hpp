@@ -3,6 +3,8 @@
 #pragma once
 
 #include <Eigen/Core>
+#include <algorithm>
+#include <cstddef>
 #include <cstdint>
 #include <vector>
 
@@ -14,8 +16,18 @@ class Terrain {
   /// \param low_m, high_m corners of the rectangle \param grade steepest slope (0.05 is five per cent)
   Terrain(std::uint64_t seed, const Eigen::Vector2d& low_m, const Eigen::Vector2d& high_m, double grade);
 
-  /// Height at a place, metres.
-  double Height(double x_m, double y_m) const;
+  /// Height at a place, metres. Inline: casting a sweep asks a million times.
+  double Height(double x_m, double y_m) const {
+    const double u = std::clamp((x_m - low_m_.x()) * per_spacing_, 0.0, columns_ - 1.0);
+    const double v = std::clamp((y_m - low_m_.y()) * per_spacing_, 0.0, rows_ - 1.0);
+    const int column = std::min(static_cast<int>(u), columns_ - 2);
+    const int row = std::min(static_cast<int>(v), rows_ - 2);
+    const double a = u - column;
+    const double b = v - row;
+    const float* h = &heights_m_[static_cast<std::size_t>(row) * static_cast<std::size_t>(columns_) +
+                                 static_cast<std::size_t>(column)];
+    return (1 - b) * ((1 - a) * h[0] + a * h[1]) + b * ((1 - a) * h[columns_] + a * h[columns_ + 1]);
+  }
 
   /// Upper bound of the slope between any two points.
   double steepest() const { return steepest_; }
@@ -26,6 +38,7 @@ class Terrain {
  private:
   Eigen::Vector2d low_m_;
   double spacing_m_;
+  double per_spacing_;
   int columns_;
   int rows_;
   double steepest_;

@@ -41,7 +41,11 @@ Town::Town(const Route& route, const TownParameters& parameters)
       trajectory_(route),
       terrain_(TerrainAround(trajectory_, parameters)),
       plan_(PlanTown(trajectory_, parameters)) {
-  for (std::uint32_t i = 0; i < plan_.size(); ++i) cells_[CellKey(plan_[i].footprint.centre_m)].push_back(i);
+  for (std::uint32_t i = 0; i < plan_.size(); ++i) {
+    const Eigen::Vector2d& at = plan_[i].footprint.centre_m;
+    cells_[CellKey(at)].push_back(i);
+    if (plan_[i].kind == ItemKind::kParkingSpot) visits_[i] = trajectory_.Visits(at, kVisitRadius_m, kVisitGap_s);
+  }
   PlanTraffic();
 }
 
@@ -77,19 +81,20 @@ PlacedItem Town::Place(const Item& item, std::shared_ptr<const std::vector<Primi
   return placed;
 }
 
-std::vector<Item> Town::ParkedAt(const Item& spot, double time_s) const {
+std::optional<Item> Town::ParkedAt(std::size_t index, double time_s) const {
+  const Item& spot = plan_.at(index);
   const Eigen::Vector2d& at = spot.footprint.centre_m;
   std::uint64_t state = HashOf(spot.seed, 17);
   if (parameters_.day != 0 && ToUnit(HashOf(spot.seed, 18, parameters_.day)) < parameters_.parked_change * 1.3) {
     state = HashOf(spot.seed, 19, parameters_.day);
   }
-  const std::vector<Visit> visits = trajectory_.Visits(at, kVisitRadius_m, kVisitGap_s);
+  const std::vector<Visit>& visits = visits_.at(index);
   for (std::size_t k = 1; k < visits.size() && visits[k].begin_s <= time_s; ++k) {
     if (visits[k].begin_s - visits[k - 1].end_s < kChangeGap_s) continue;
     const std::uint64_t draw = HashOf(spot.seed, k, parameters_.day);
     if (ToUnit(draw) < parameters_.parked_change) state = Mix(draw);
   }
-  if (!(ToUnit(HashOf(state, 1)) < kOccupied)) return {};
+  if (!(ToUnit(HashOf(state, 1)) < kOccupied)) return std::nullopt;
   Item vehicle = RandomVehicle(parameters_.look_alike ? spot.seed : HashOf(state, 2));
   if (!parameters_.look_alike) {
     // Cars longer than the spot don't park there.
@@ -103,7 +108,7 @@ std::vector<Item> Town::ParkedAt(const Item& spot, double time_s) const {
   vehicle.footprint.yaw_rad = spot.footprint.yaw_rad + (parameters_.look_alike ? 0.0 : random.Uniform(-0.03, 0.03));
   vehicle.footprint.centre_m = at;
   if (!parameters_.look_alike) vehicle.footprint.centre_m += Eigen::Rotation2Dd(spot.footprint.yaw_rad) * shift;
-  return {vehicle};
+  return vehicle;
 }
 
 void Town::ForgetFar(const Eigen::Vector2d& position_m) {
@@ -134,8 +139,8 @@ std::vector<PlacedItem> Town::ItemsNear(const Eigen::Vector2d& position_m, doubl
   for (const std::uint32_t index : near) {
     const Item& item = plan_[index];
     if (item.kind == ItemKind::kParkingSpot) {
-      for (const Item& vehicle : ParkedAt(item, time_s)) {
-        items.push_back(Place(vehicle, std::make_shared<const std::vector<Primitive>>(BuildItem(vehicle))));
+      if (const std::optional<Item> vehicle = ParkedAt(index, time_s)) {
+        items.push_back(Place(*vehicle, std::make_shared<const std::vector<Primitive>>(BuildItem(*vehicle))));
       }
       continue;
     }

@@ -5,6 +5,7 @@
 #include <Eigen/Geometry>
 #include <cstdint>
 #include <memory>
+#include <optional>
 #include <unordered_map>
 #include <vector>
 
@@ -44,8 +45,8 @@ class Town {
   /// What is within radius_m of a place at a time, in an order that depends only on the plan.
   std::vector<PlacedItem> ItemsNear(const Eigen::Vector2d& position_m, double radius_m, double time_s);
 
-  /// The vehicle on a parking spot at a time, if any: footprint in the world.
-  std::vector<Item> ParkedAt(const Item& spot, double time_s) const;
+  /// The vehicle on a parking spot, given by its index in the plan, at a time, if any: footprint in the world.
+  std::optional<Item> ParkedAt(std::size_t spot, double time_s) const;
 
  private:
   struct Meeting {
@@ -69,6 +70,7 @@ class Town {
   std::vector<Item> plan_;
   std::unordered_map<std::uint64_t, std::vector<std::uint32_t>> cells_;
   std::unordered_map<std::uint64_t, std::shared_ptr<const std::vector<Primitive>>> geometry_;  // by item index and make
+  std::unordered_map<std::size_t, std::vector<Visit>> visits_;  // by index of the parking spot in the plan
   Eigen::Vector2d swept_at_m_ = Eigen::Vector2d::Zero();
   std::vector<Meeting> meetings_;
   std::vector<Walker> walkers_;

@@ -89,9 +89,9 @@ TEST(SimulationTest, AnotherDayKeepsTheTownAndChangesTheCars) {
   for (std::size_t i = 0; i < plan.size(); ++i) {
     ASSERT_EQ(plan[i].seed, tomorrow.town().plan()[i].seed);
     if (plan[i].kind != ItemKind::kParkingSpot) continue;
-    const auto a = today.town().ParkedAt(plan[i], 0.0), b = tomorrow.town().ParkedAt(plan[i], 0.0);
+    const auto a = today.town().ParkedAt(i, 0.0), b = tomorrow.town().ParkedAt(i, 0.0);
     ++spots;
-    changed += a.size() != b.size() || (!a.empty() && a[0].seed != b[0].seed);
+    changed += a.has_value() != b.has_value() || (a && a->seed != b->seed);
   }
   ASSERT_GT(spots, 50u);
   EXPECT_GT(changed, spots / 5);
@@ -101,14 +101,14 @@ TEST(SimulationTest, AnotherDayKeepsTheTownAndChangesTheCars) {
 TEST(SimulationTest, ParkedCarsChangeOnlyBetweenVisitsAMinuteApart) {
   Simulation simulation(Options("loops"));
   const Town& town = simulation.town();
-  const auto state = [&](const Item& spot, double time_s) {
+  const auto state = [&](std::size_t spot, double time_s) {
     const auto parked = town.ParkedAt(spot, time_s);
-    return parked.empty() ? std::uint64_t{0} : parked[0].seed;
+    return parked ? parked->seed : std::uint64_t{0};
   };
   std::size_t returns = 0, changed = 0;
-  for (const Item& spot : town.plan()) {
-    if (spot.kind != ItemKind::kParkingSpot) continue;
-    const auto visits = town.trajectory().Visits(spot.footprint.centre_m, 80.0, 20.0);
+  for (std::size_t spot = 0; spot < town.plan().size(); ++spot) {
+    if (town.plan()[spot].kind != ItemKind::kParkingSpot) continue;
+    const auto visits = town.trajectory().Visits(town.plan()[spot].footprint.centre_m, 80.0, 20.0);
     for (std::size_t k = 0; k < visits.size(); ++k) {
       EXPECT_EQ(state(spot, visits[k].begin_s), state(spot, visits[k].end_s));
       if (k == 0 || visits[k].begin_s - visits[k - 1].end_s < 60.0) continue;
