@@ -137,8 +137,13 @@ BackEndStep BackEnd::Process(const SegmentDelta& delta) {
 
   step.counts.end = ToStepEnd(result.outcome);
   if (result.recognition) {
-    step.closure = Verify(robot, delta.stamp_ns, result, &step.counts);
-    if (step.closure) AcceptClosure(robot, *step.closure);
+    std::optional<Closure> judged = Verify(robot, delta.stamp_ns, result, &step.counts);
+    if (step.counts.end == StepEnd::kRecognized) {
+      step.closure = std::move(judged);
+      AcceptClosure(robot, *step.closure);
+    } else {
+      step.refused = std::move(judged);
+    }
   }
   timer.Lap("refinement");
 
@@ -369,7 +374,8 @@ const SegmentView& BackEnd::MatchedView(RobotIndex robot, const Correspondence& 
   throw std::logic_error("an inlier is none of the candidates");
 }
 
-/// Refines a recognition on points, gathers the evidence for it and judges that. `counts` gets the evidence and the end.
+/// Refines a recognition on points, gathers the evidence for it and judges that. `counts` gets the evidence and the end, which
+/// says whether what comes back is accepted.
 std::optional<Closure> BackEnd::Verify(RobotIndex robot, StampNs stamp_ns, const RecognizerResult& result,
                                            BackEndCounts* counts) const {
   Recognition recognition = *result.recognition;
@@ -397,7 +403,6 @@ std::optional<Closure> BackEnd::Verify(RobotIndex robot, StampNs stamp_ns, const
   evidence.sigma_rad = LargestSigma(closure->covariance.bottomRightCorner<3, 3>());
   counts->evidence = evidence;
   counts->end = ToStepEnd(Judge(evidence, parameters_.acceptance));
-  if (counts->end != StepEnd::kRecognized) return std::nullopt;
   closure->candidates = result.candidates;
   closure->evidence = evidence;
   return closure;

@@ -114,6 +114,7 @@ struct BackEndCounts {
 /// What came of one delta.
 struct BackEndStep {
   std::optional<Closure> closure;  ///< the place, if one was recognised
+  std::optional<Closure> refused;  ///< what was recognised, but refused for its evidence (counts.end says why)
   bool missed_delta = false;       ///< a delta is missing: ask the robot for a full state; this one was not applied
   std::vector<SegmentMatch> candidates;  ///< all that entered recognition
   BackEndCounts counts;                  ///< the funnel

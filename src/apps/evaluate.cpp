@@ -2,6 +2,7 @@
 
 #include <cmath>
 #include <cstdio>
+#include <filesystem>
 #include <memory>
 #include <random>
 #include <string>
@@ -13,6 +14,7 @@
 #include "evaluation/evaluation.hpp"
 #include "evaluation/kidnapped_drive.hpp"
 #include "evaluation/kitti_io.hpp"
+#include "evaluation/recorded_run.hpp"
 #ifdef SEGMATCH_WITH_ROSBAG
 #include "evaluation/bag.hpp"
 #endif
@@ -27,6 +29,8 @@ struct EvaluateArguments {
   SimulationArguments simulation;
   std::string config;
   std::string out;
+  std::string mode;
+  KittiDriveOptions map_drive;
   unsigned kidnap_seed = 0;
   bool no_optimization = false;
   EvaluationParameters parameters;
@@ -58,9 +62,25 @@ Pose RandomPlacement(unsigned seed) {
   return T;
 }
 
+// The truth of the map's drive: as given, or as saved with the map.
+std::optional<TrueTrajectory> ReadMapTruth(const EvaluateArguments& arguments) {
+  if (!arguments.map_drive.root.empty()) return ReadKittiTruth(arguments.map_drive.root, arguments.map_drive.sequence);
+  const std::string path = MapTruthPath(arguments.parameters.map_file);
+  if (!std::filesystem::exists(path)) return std::nullopt;
+  TrueTrajectory truth;
+  for (const StampedPose& pose : ReadTum(path)) {
+    truth.stamps_ns.push_back(pose.stamp_ns);
+    truth.T_world_sensor.push_back(pose.T_frame_sensor);
+  }
+  return truth;
+}
+
 void RunEvaluation(EvaluateArguments arguments) {
   EvaluationParameters& parameters = arguments.parameters;
   if (!arguments.config.empty()) parameters.core = LoadParameters(arguments.config);
+  if (!arguments.mode.empty())
+    parameters.core.back_end.mode = arguments.mode == "localization" ? Mode::kLocalization : Mode::kLoopClosure;
+  if (!parameters.map_file.empty()) parameters.map_truth = ReadMapTruth(arguments);
   parameters.optimize = !arguments.no_optimization && arguments.kidnap_seed == 0;
   const std::unique_ptr<DriveSource> drive = OpenDrive(arguments);
   KidnappedDrive kidnapped(*drive, drive->size() / 2, RandomPlacement(arguments.kidnap_seed));
@@ -71,7 +91,7 @@ void RunEvaluation(EvaluateArguments arguments) {
     result = Evaluate(input, parameters, [&bar](std::size_t done, std::size_t) { bar.Update(done); });
   }
   WriteResults(result, parameters, arguments.out);
-  std::printf("%s\nwritten to %s: closures.csv steps.csv summary.json trajectory_*.tum\n",
+  std::printf("%s\nwritten to %s: report.html summary.json closures.csv steps.csv missed.csv trajectory_*.tum\n",
               FormatSummary(result).c_str(), arguments.out.c_str());
 }
 
@@ -108,8 +128,8 @@ void AddInputOptions(CLI::App& command, EvaluateArguments& arguments) {
       ->needs(bag);
 
   CLI::App* with_simulate = command.add_option_group("With --simulate");
-  AddRouteOptions(*with_simulate, &arguments.simulation);
-  AddSimulationOptions(*with_simulate, &arguments.simulation);
+  AddDriveOptions(*with_simulate, &arguments.simulation);
+  AddSensorOptions(*with_simulate, &arguments.simulation);
   for (CLI::Option* option : with_simulate->get_options()) option->needs(simulate);
 }
 
@@ -121,13 +141,15 @@ void AddEvaluateCommand(CLI::App& app) {
       "evaluate",
       "Run a drive through the whole pipeline as fast as it goes: segments, recognitions, pose graph. Ground truth, "
       "where\n"
-      "there is one, is used for scoring only. Writes closures.csv, steps.csv (times and counts of every stage),\n"
-      "trajectory_odometry.tum, trajectory_optimized.tum, pose_graph.g2o, parameters.yaml and summary.json, and prints "
-      "a\n"
-      "summary.\n\n"
+      "there is one, is used for scoring only. Writes report.html (the run as a page), summary.json, closures.csv, "
+      "steps.csv\n"
+      "(times and counts of every stage), missed.csv (revisits that were not recognised, and why), "
+      "trajectory_odometry.tum,\n"
+      "trajectory_optimized.tum, pose_graph.g2o and parameters.yaml, and prints a summary.\n\n"
       "  segmatch evaluate --kitti data --sequence 00 --odometry odometry.txt --out result\n"
       "  segmatch evaluate --bag town.bag --out result\n"
-      "  segmatch evaluate --simulate --route loops --stride 2 --out result\n\n"
+      "  segmatch evaluate --simulate --route loops --stride 2 --save-map town.map --out result\n"
+      "  segmatch evaluate --simulate --route loops --day 1 --map town.map --mode localization --out day1\n\n"
       "A closure counts if its target is more than 60 s and 50 m of path older, and is true if its relative pose is "
       "within\n"
       "1 m and 3 degrees of the truth. A revisit is a step within 5 m of a pose that much older.\n");
@@ -135,6 +157,28 @@ void AddEvaluateCommand(CLI::App& app) {
   EvaluationParameters& parameters = arguments->parameters;
   command->add_option("--out", arguments->out, "folder to write into; made if need be")->required();
   command->add_option("--config", arguments->config, "YAML with parameters that differ from the defaults");
+  CLI::Option* mode =
+      command
+          ->add_option(
+              "--mode", arguments->mode,
+              "loop_closure: the map is what this drive has seen; localization: in a map of an earlier drive,\n"
+              "whose clock the stamps of targets are on. Default: as --config says")
+          ->check(CLI::IsMember({"loop_closure", "localization"}));
+  CLI::Option* map = command->add_option("--map", parameters.map_file, "map to localize in, saved by an earlier run")
+                         ->check(CLI::ExistingFile)
+                         ->needs(mode);
+  CLI::Option* map_kitti =
+      command
+          ->add_option("--map-kitti", arguments->map_drive.root,
+                       "KITTI layout of the map's drive, for its truth, in the same world frame as this drive's.\n"
+                       "Default: the truth that was saved beside the map")
+          ->needs(map);
+  CLI::Option* map_sequence =
+      command->add_option("--map-sequence", arguments->map_drive.sequence, "name of the map's sequence")
+          ->needs(map_kitti);
+  map_kitti->needs(map_sequence);
+  command->add_option("--save-map", parameters.save_map,
+                      "save the map in the end, and the truth of this drive, if it is known, beside it");
   command->add_option("--max-steps", parameters.max_steps, "stop after this many scans")->check(CLI::PositiveNumber);
   command
       ->add_option("--closure-spacing", parameters.closure_spacing_m,

@@ -3,6 +3,7 @@
 #include <exception>
 
 #include "apps/evaluate.hpp"
+#include "apps/experiment.hpp"
 #include "apps/kitti2bag.hpp"
 #include "apps/score.hpp"
 #include "apps/simulate.hpp"
@@ -29,6 +30,7 @@ int main(int argc, char** argv) {
   AddKitti2BagCommand(app);
   AddEvaluateCommand(app);
   AddScoreCommand(app);
+  AddExperimentCommand(app);
   try {
     app.parse(argc, argv);
   } catch (const CLI::ParseError& error) {

@@ -53,19 +53,11 @@ void PrintFalseClosures(const RecordedRun& run, const Score& score) {
 
 // The scans themselves are not needed, and may be gone.
 void ScoreRun(const ScoreArguments& arguments) {
-  const std::string folder = arguments.root + "/sequences/" + arguments.sequence;
-  const std::string poses_file = arguments.root + "/poses/" + arguments.sequence + ".txt";
-  std::vector<StampNs> stamps_ns = ReadKittiTimes(folder + "/times.txt");
-  for (StampNs& stamp_ns : stamps_ns) stamp_ns += arguments.epoch_s * 1'000'000'000;
-  const std::vector<Pose> truth =
-      SensorPosesFromCameraPoses(ReadKittiPoses(poses_file), ReadKittiCalibration(folder + "/calib.txt"));
-  if (truth.size() != stamps_ns.size()) {
-    throw std::runtime_error(poses_file + " has " + std::to_string(truth.size()) + " poses, but times.txt " +
-                             std::to_string(stamps_ns.size()) + " stamps: are they of one drive?");
-  }
+  TrueTrajectory truth = ReadKittiTruth(arguments.root, arguments.sequence);
+  for (StampNs& stamp_ns : truth.stamps_ns) stamp_ns += arguments.epoch_s * 1'000'000'000;
   const RecordedRun run = ReadRecordedRun(arguments.results);
-  const Score score = ScoreClosures(stamps_ns, truth, run.closures, {});
-  PrintScore(score, MeasureRun(run, stamps_ns, truth));
+  const Score score = ScoreClosures(truth, run.closures, {});
+  PrintScore(score, MeasureRun(run, truth.stamps_ns, truth.T_world_sensor));
   if (score.false_closures > 0) std::printf("the false closures:\n");
   PrintFalseClosures(run, score);
   if (score.true_closures == 0) throw std::runtime_error("no loop was found");

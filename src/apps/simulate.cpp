@@ -42,8 +42,8 @@ void AddSimulateCommand(CLI::App& app) {
       "  segmatch simulate --out data --day 1 --sequence 01  the same streets on another day\n");
   command->add_option("--out", arguments->out, "folder to write into (ROOT)")->required();
   command->add_option("--sequence", arguments->sequence, "name of the sequence (SS)")->capture_default_str();
-  AddRouteOptions(*command, &arguments->simulation);
-  AddSimulationOptions(*command, &arguments->simulation);
+  AddDriveOptions(*command, &arguments->simulation);
+  AddSensorOptions(*command, &arguments->simulation);
   command->callback([arguments] { Simulate(*arguments); });
 }
 

@@ -9,7 +9,7 @@ simulator::SimulationOptions SimulationArguments::Resolve() const {
   return resolved;
 }
 
-void AddRouteOptions(CLI::App& command, SimulationArguments* arguments) {
+void AddDriveOptions(CLI::App& command, SimulationArguments* arguments) {
   simulator::SimulationOptions& options = arguments->options;
   CLI::Option* route = command
                            .add_option("--route", options.route,
@@ -27,6 +27,9 @@ void AddRouteOptions(CLI::App& command, SimulationArguments* arguments) {
   command.add_option("--laps", options.laps, "laps of the route lap")
       ->check(CLI::PositiveNumber)
       ->capture_default_str();
+  command.add_option("--seed", options.seed, "of the town, the noise and the drift")->capture_default_str();
+  command.add_option("--day", options.day, "another day in the same town: other parked cars, traffic, noise, drift")
+      ->capture_default_str();
   command.add_option("--first-frame", options.first_frame, "skip this many frames of the route")
       ->check(CLI::NonNegativeNumber)
       ->capture_default_str();
@@ -35,13 +38,10 @@ void AddRouteOptions(CLI::App& command, SimulationArguments* arguments) {
       ->capture_default_str();
 }
 
-void AddSimulationOptions(CLI::App& command, SimulationArguments* arguments) {
+void AddSensorOptions(CLI::App& command, SimulationArguments* arguments) {
   simulator::SimulationOptions& options = arguments->options;
   command.add_option("--sensor", options.sensor, "LiDAR")
       ->check(CLI::IsMember(simulator::SensorNames()))
-      ->capture_default_str();
-  command.add_option("--seed", options.seed, "of the town, the noise and the drift")->capture_default_str();
-  command.add_option("--day", options.day, "another day in the same town: other parked cars, traffic, noise, drift")
       ->capture_default_str();
   command.add_option("--stride", options.stride, "keep every n-th frame")
       ->check(CLI::PositiveNumber)

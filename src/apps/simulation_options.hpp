@@ -17,11 +17,11 @@ struct SimulationArguments {
   simulator::SimulationOptions Resolve() const;
 };
 
-/// Adds --route and --poses: where to drive.
-void AddRouteOptions(CLI::App& command, SimulationArguments* arguments);
+/// Adds the options that say which drive: route or pose file, which part of it, seed and day.
+void AddDriveOptions(CLI::App& command, SimulationArguments* arguments);
 
-/// Adds everything else: sensor, seed, day, frames, drift, noise, ground.
-void AddSimulationOptions(CLI::App& command, SimulationArguments* arguments);
+/// Adds the options that say how it is driven and seen: sensor, rates, drift, noise, ground.
+void AddSensorOptions(CLI::App& command, SimulationArguments* arguments);
 
 /// What --route or --poses says, for people: "route loops", or the file.
 std::string RouteName(const simulator::SimulationOptions& options);

@@ -2,9 +2,11 @@
 
 #include <algorithm>
 #include <chrono>
+#include <stdexcept>
 
 #include "incremental_segmatch/back_end.hpp"
 #include "incremental_segmatch/front_end.hpp"
+#include "incremental_segmatch/pose_graph_io.hpp"
 
 namespace incremental_segmatch {
 namespace {
@@ -20,6 +22,14 @@ class Stopwatch {
  private:
   std::chrono::steady_clock::time_point start_ = std::chrono::steady_clock::now();
 };
+
+BackEnd MakeBackEnd(const EvaluationParameters& parameters) {
+  const BackEndParameters& core = parameters.core.back_end;
+  if (core.mode == Mode::kLoopClosure && parameters.map_file.empty()) return BackEnd(core);
+  if (core.mode == Mode::kLoopClosure || parameters.map_file.empty())
+    throw std::invalid_argument("localization and a map to localize in need each other");
+  return BackEnd(core, TargetMap::Load(parameters.map_file, core.target_map));
+}
 
 ClosureRow ToRow(const Closure& closure) {
   return {closure.stamp_query_ns, closure.stamp_target_ns, closure.robot_query, closure.robot_target,
@@ -91,22 +101,46 @@ class LoopCloser {
 };
 
 // Truth of the first `steps` scans; nothing if any of them has none.
-std::optional<std::vector<Pose>> ReadTruth(const DriveSource& drive, std::size_t steps) {
-  std::vector<Pose> truth;
+std::optional<TrueTrajectory> ReadTruth(const DriveSource& drive, std::size_t steps) {
+  TrueTrajectory truth;
   for (std::size_t i = 0; i < steps; ++i) {
     const std::optional<Pose> pose = drive.T_world_sensor(i);
     if (!pose) return std::nullopt;
-    truth.push_back(*pose);
+    truth.stamps_ns.push_back(drive.stamp_ns(i));
+    truth.T_world_sensor.push_back(*pose);
   }
   return truth;
 }
 
-TrajectoryErrors MeasureErrors(const EvaluationResult& result, const std::vector<StampNs>& stamps_ns,
-                               const std::vector<Pose>& truth, const PoseGraphParameters& parameters) {
+// Scores what was accepted, and judges all that was judged.
+void ScoreResult(const ScoringParameters& parameters, EvaluationResult* result) {
+  const auto score = [&](const std::vector<ClosureRow>& closures) {
+    return result->map_truth ? ScoreLocalizations(*result->truth, *result->map_truth, closures, parameters)
+                             : ScoreClosures(*result->truth, closures, parameters);
+  };
+  result->score = score(result->closures);
+  std::vector<ClosureRow> rows;
+  for (const JudgedRecognition& recognition : result->recognitions) rows.push_back(recognition.closure);
+  const Score judged = score(rows);
+  for (std::size_t i = 0; i < rows.size(); ++i) result->recognitions[i].judged = judged.judged[i];
+}
+
+// With the map goes the truth of the drive that it was made of, for scoring localizations in it.
+void SaveMap(const TargetMap& map, const std::optional<TrueTrajectory>& truth, const std::string& path) {
+  map.Save(path);
+  if (!truth) return;
+  std::vector<StampedPose> trajectory;
+  for (std::size_t i = 0; i < truth->stamps_ns.size(); ++i)
+    trajectory.push_back({truth->stamps_ns[i], truth->T_world_sensor[i]});
+  WriteTum(trajectory, MapTruthPath(path));
+}
+
+TrajectoryErrors MeasureErrors(const EvaluationResult& result, const PoseGraphParameters& parameters) {
   const std::vector<Pose> odometry = PosesOf(result.odometry);
+  const std::vector<Pose>& truth = result.truth->T_world_sensor;
   const auto bound = [&](const std::vector<GraphClosure>& closures) {
-    return AbsoluteTrajectoryError(PosesOf(OptimizeWithTrueClosures(stamps_ns, odometry, truth, closures, parameters)),
-                                   truth);
+    return AbsoluteTrajectoryError(
+        PosesOf(OptimizeWithTrueClosures(result.truth->stamps_ns, odometry, truth, closures, parameters)), truth);
   };
   std::vector<GraphClosure> every_revisit;
   for (std::size_t i = 0; i < truth.size(); ++i) {
@@ -123,18 +157,23 @@ TrajectoryErrors MeasureErrors(const EvaluationResult& result, const std::vector
 
 }  // namespace
 
+std::string MapTruthPath(const std::string& map_file) {
+  return map_file + ".truth.tum";
+}
+
 EvaluationResult Evaluate(DriveSource& drive, const EvaluationParameters& parameters,
                           const std::function<void(std::size_t, std::size_t)>& progress) {
   const Stopwatch run;
   const std::size_t steps = std::min(drive.size(), parameters.max_steps);
   FrontEnd front_end(parameters.core.front_end, parameters.robot);
-  BackEnd back_end(parameters.core.back_end);
+  BackEnd back_end = MakeBackEnd(parameters);
+  const bool optimize = parameters.optimize && parameters.map_file.empty();
   LoopCloser closer(parameters);
   EvaluationResult result;
   result.drive = drive.name();
   result.notes = drive.notes();
   result.odometry_is_truth = drive.odometry_is_truth();
-  std::vector<StampNs> stamps_ns;
+  result.min_clique = parameters.core.back_end.recognizer.clique.min_size;
 
   for (std::size_t i = 0; i < steps; ++i) {
     StepRecord record;
@@ -152,11 +191,13 @@ EvaluationResult Evaluate(DriveSource& drive, const EvaluationParameters& parame
     record.stages.insert(record.stages.end(), recognized.times.begin(), recognized.times.end());
     record.front_end = seen.counts;
     record.back_end = recognized.counts;
-    stamps_ns.push_back(scan.stamp_ns);
+    record.described = seen.delta.changed.size();
     result.odometry.push_back({scan.stamp_ns, scan.T_odom_sensor});
     if (recognized.closure) result.closures.push_back(ToRow(*recognized.closure));
+    if (const std::optional<Closure>& judged = recognized.closure ? recognized.closure : recognized.refused)
+      result.recognitions.push_back({i, ToRow(*judged), judged->evidence, recognized.counts.end, {}});
 
-    if (parameters.optimize) {
+    if (optimize) {
       closer.AddPose(result.odometry.back());
       const Stopwatch optimization;
       if (recognized.closure && closer.AddClosure(*recognized.closure)) {
@@ -170,19 +211,22 @@ EvaluationResult Evaluate(DriveSource& drive, const EvaluationParameters& parame
   }
 
   result.optimized = result.odometry;
-  if (parameters.optimize && steps > 0) {
+  if (optimize && steps > 0) {
     closer.Optimize();
     result.last_optimization = closer.report();
     result.optimized = closer.Trajectory();
     result.pose_graph = closer.TakeGraph();
   }
-  const std::optional<std::vector<Pose>> truth = ReadTruth(drive, steps);
-  if (truth && steps > 0) {
-    result.score = ScoreClosures(stamps_ns, *truth, result.closures, parameters.scoring);
-    if (parameters.optimize) {
-      result.trajectory_error = MeasureErrors(result, stamps_ns, *truth, parameters.pose_graph);
-    }
+  if (steps > 0) result.truth = ReadTruth(drive, steps);
+  if (!parameters.save_map.empty()) {
+    if (optimize) back_end.CorrectTrajectory(parameters.robot, result.optimized);
+    SaveMap(back_end.map(), result.truth, parameters.save_map);
   }
+  result.map_truth = parameters.map_truth;
+  if (result.truth && (parameters.map_file.empty() || result.map_truth)) ScoreResult(parameters.scoring, &result);
+  if (result.score && optimize) result.trajectory_error = MeasureErrors(result, parameters.pose_graph);
+  if (!parameters.map_file.empty() && !result.map_truth)
+    result.notes.push_back("the truth of the map's drive is not known: nothing is scored");
   result.seconds = run.Milliseconds() / 1000.0;
   return result;
 }

@@ -26,7 +26,13 @@ struct EvaluationParameters {
   double optimization_spacing_m = 10.0;  ///< path between optimizations, each of which needs a new closure
   std::size_t max_steps = std::numeric_limits<std::size_t>::max();
   std::string robot = "robot";  ///< name in the output
+  std::string map_file;         ///< to localize in, with core.back_end.mode kLocalization; nothing is optimized then
+  std::optional<TrueTrajectory> map_truth;  ///< of the drive that the map was made of; without it nothing is scored
+  std::string save_map;                     ///< where to save the map in the end, with its truth beside; empty: nowhere
 };
+
+/// Where the truth of a map's drive is, beside the map: TUM rows of T_world_sensor.
+std::string MapTruthPath(const std::string& map_file);
 
 /// A row of steps.csv.
 struct StepRecord {
@@ -35,8 +41,18 @@ struct StepRecord {
   double read_ms = 0.0;      ///< getting the scan
   double optimize_ms = 0.0;  ///< pose graph and correction of the target map, 0 if it was not this step's turn
   StageTimes stages;
+  std::size_t described = 0;  ///< segments that changed in this step, and so were described anew
   FrontEndCounts front_end;
   BackEndCounts back_end;
+};
+
+/// A recognition that came as far as to be judged by its evidence, accepted or not.
+struct JudgedRecognition {
+  std::size_t step = 0;
+  ClosureRow closure;
+  Evidence evidence;
+  StepEnd end = StepEnd::kRecognized;  ///< kRecognized: accepted
+  JudgedClosure judged;                ///< against the truth, where there is one
 };
 
 /// Root mean square position errors after alignment, in metres.
@@ -53,13 +69,17 @@ struct EvaluationResult {
   std::vector<std::string> notes;
   bool odometry_is_truth = false;
   std::vector<StepRecord> steps;
-  std::vector<ClosureRow> closures;
-  std::vector<GraphClosure> graph_closures;  ///< those that entered the pose graph
+  std::vector<ClosureRow> closures;             ///< accepted recognitions
+  std::vector<JudgedRecognition> recognitions;  ///< all that were judged
+  std::size_t min_clique = 0;                   ///< T: smaller consistent sets are no recognition
+  std::vector<GraphClosure> graph_closures;     ///< those that entered the pose graph
   std::vector<StampedPose> odometry;
   std::vector<StampedPose> optimized;   ///< equal to the odometry without optimization
   std::optional<PoseGraph> pose_graph;  ///< with optimization
   PoseGraphReport last_optimization;
   double seconds = 0.0;                              ///< of the whole run, by the clock on the wall
+  std::optional<TrueTrajectory> truth;               ///< where there is ground truth
+  std::optional<TrueTrajectory> map_truth;           ///< of the map's drive, in localization, where it is known
   std::optional<Score> score;                        ///< where there is ground truth
   std::optional<TrajectoryErrors> trajectory_error;  ///< where there is ground truth and optimization
 };
@@ -68,9 +88,9 @@ struct EvaluationResult {
 EvaluationResult Evaluate(DriveSource& drive, const EvaluationParameters& parameters,
                           const std::function<void(std::size_t, std::size_t)>& progress = {});
 
-/// Writes closures.csv, steps.csv, trajectory_odometry.tum, trajectory_optimized.tum, pose_graph.g2o (with
-/// optimization), summary.json and parameters.yaml into a folder that is made if need be. Throws std::runtime_error
-/// naming the file.
+/// Writes report.html, closures.csv, steps.csv, missed.csv (with ground truth), trajectory_odometry.tum,
+/// trajectory_optimized.tum, pose_graph.g2o (with optimization), summary.json and parameters.yaml into a folder that is
+/// made if need be. Throws std::runtime_error naming the file.
 void WriteResults(const EvaluationResult& result, const EvaluationParameters& parameters, const std::string& folder);
 
 /// The summary as text for people.

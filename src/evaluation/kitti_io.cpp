@@ -171,6 +171,20 @@ std::vector<Pose> SensorPosesFromCameraPoses(const std::vector<Pose>& camera_pos
   return poses;
 }
 
+TrueTrajectory ReadKittiTruth(const std::string& root, const std::string& sequence) {
+  const std::string folder = root + "/sequences/" + sequence, poses_file = root + "/poses/" + sequence + ".txt";
+  TrueTrajectory truth;
+  truth.stamps_ns = ReadKittiTimes(folder + "/times.txt");
+  truth.T_world_sensor =
+      SensorPosesFromCameraPoses(ReadKittiPoses(poses_file), ReadKittiCalibration(folder + "/calib.txt"));
+  if (truth.T_world_sensor.size() != truth.stamps_ns.size()) {
+    throw std::runtime_error(poses_file + " has " + std::to_string(truth.T_world_sensor.size()) +
+                             " poses, but times.txt " + std::to_string(truth.stamps_ns.size()) +
+                             " stamps: are they of one drive?");
+  }
+  return truth;
+}
+
 bool HasKittiOdometry(const std::string& root, const std::string& sequence) {
   return fs::exists(root + "/sequences/" + sequence + "/odometry.txt");
 }

@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "drive_source.hpp"
+#include "evaluation/scoring.hpp"
 #include "incremental_segmatch/types.hpp"
 
 namespace incremental_segmatch {
@@ -33,6 +34,9 @@ Pose ReadKittiCalibration(const std::string& path);
 /// Poses of the LiDAR from those of camera 0: T_0_i = Tr^-1 P_i Tr, where frame 0 is the LiDAR whose camera is at the
 /// poses' origin.
 std::vector<Pose> SensorPosesFromCameraPoses(const std::vector<Pose>& camera_poses, const Pose& T_camera_sensor);
+
+/// The truth of a sequence: stamps of times.txt, poses of the LiDAR. The scans are not needed. One pose for each stamp.
+TrueTrajectory ReadKittiTruth(const std::string& root, const std::string& sequence);
 
 /// Which files to read.
 struct KittiDriveOptions {

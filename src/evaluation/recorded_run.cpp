@@ -53,21 +53,6 @@ std::optional<Pose> ParsePose(std::istream& stream) {
   return T;
 }
 
-std::vector<StampedPose> ReadTum(const std::string& path) {
-  std::vector<StampedPose> trajectory;
-  ReadLines(path, [&trajectory](const std::string& line) {
-    std::istringstream stream(line);
-    std::string stamp;
-    stream >> stamp;
-    const std::optional<StampNs> stamp_ns = ParseSeconds(stamp);
-    const std::optional<Pose> pose = ParsePose(stream);
-    if (!stamp_ns || !pose) return false;
-    trajectory.push_back({*stamp_ns, *pose});
-    return true;
-  });
-  return trajectory;
-}
-
 std::optional<ClosureRow> ParseClosure(std::string line) {
   std::replace(line.begin(), line.end(), ',', ' ');
   std::istringstream stream(line);
@@ -131,6 +116,21 @@ std::vector<GraphClosure> ReadG2oClosures(const std::string& path) {
 }
 
 }  // namespace
+
+std::vector<StampedPose> ReadTum(const std::string& path) {
+  std::vector<StampedPose> trajectory;
+  ReadLines(path, [&trajectory](const std::string& line) {
+    std::istringstream stream(line);
+    std::string stamp;
+    stream >> stamp;
+    const std::optional<StampNs> stamp_ns = ParseSeconds(stamp);
+    const std::optional<Pose> pose = ParsePose(stream);
+    if (!stamp_ns || !pose) return false;
+    trajectory.push_back({*stamp_ns, *pose});
+    return true;
+  });
+  return trajectory;
+}
 
 RecordedRun ReadRecordedRun(const std::string& folder) {
   RecordedRun run;

@@ -19,6 +19,9 @@ struct RecordedRun {
   std::vector<GraphClosure> graph_closures;  ///< of pose_graph.g2o: the edges that are no odometry
 };
 
+/// Reads a trajectory in TUM's format: seconds x y z qx qy qz qw. Throws std::runtime_error naming the file and line.
+std::vector<StampedPose> ReadTum(const std::string& path);
+
 /// Reads a folder. All errors are std::runtime_error naming the file and line.
 RecordedRun ReadRecordedRun(const std::string& folder);
 

@@ -1,120 +1,19 @@
+#include <algorithm>
 #include <cmath>
 #include <cstdio>
 #include <filesystem>
 #include <fstream>
-#include <map>
 #include <nlohmann/json.hpp>
-#include <set>
 #include <stdexcept>
 
-#include "evaluation/evaluation.hpp"
+#include "evaluation/analysis.hpp"
+#include "evaluation/html_report.hpp"
 #include "incremental_segmatch/pose_graph_io.hpp"
 
 namespace incremental_segmatch {
 namespace {
 
 using Json = nlohmann::ordered_json;
-
-// Stages in the order in which steps first ran them.
-std::vector<std::string> StageNames(const std::vector<StepRecord>& steps) {
-  std::vector<std::string> names;
-  std::set<std::string> known;
-  for (const StepRecord& step : steps) {
-    for (const auto& stage : step.stages) {
-      if (known.insert(stage.first).second) names.push_back(stage.first);
-    }
-  }
-  return names;
-}
-
-double StageMs(const StepRecord& step, const std::string& name) {
-  double total_ms = 0.0;
-  for (const auto& stage : step.stages) total_ms += stage.first == name ? stage.second : 0.0;
-  return total_ms;
-}
-
-struct Column {
-  std::string name;
-  std::function<double(const StepRecord&)> value;
-};
-
-// The counts of a step, from the scan's points to the clique.
-std::vector<Column> CountColumns() {
-  return {{"points", [](const StepRecord& s) { return s.front_end.points; }},
-          {"points_obstacle", [](const StepRecord& s) { return s.front_end.obstacle_points; }},
-          {"points_nonfinite", [](const StepRecord& s) { return s.front_end.dropped_nonfinite; }},
-          {"points_outside", [](const StepRecord& s) { return s.front_end.dropped_outside; }},
-          {"voxels", [](const StepRecord& s) { return s.front_end.voxels; }},
-          {"voxels_activated", [](const StepRecord& s) { return s.front_end.activated_voxels; }},
-          {"voxels_removed", [](const StepRecord& s) { return s.front_end.removed_voxels; }},
-          {"clusters", [](const StepRecord& s) { return s.front_end.clusters.clusters; }},
-          {"clusters_too_small", [](const StepRecord& s) { return s.front_end.clusters.too_small; }},
-          {"clusters_too_large", [](const StepRecord& s) { return s.front_end.clusters.too_large; }},
-          {"clusters_cut", [](const StepRecord& s) { return s.front_end.clusters.cut; }},
-          {"segments", [](const StepRecord& s) { return s.front_end.clusters.segments; }},
-          {"target_segments", [](const StepRecord& s) { return s.back_end.target_segments; }},
-          {"allowed_targets", [](const StepRecord& s) { return s.back_end.allowed_targets; }},
-          {"requeried", [](const StepRecord& s) { return s.back_end.requeried; }},
-          {"candidates", [](const StepRecord& s) { return s.back_end.candidates; }},
-          {"tested_pairs", [](const StepRecord& s) { return s.back_end.tested_pairs; }},
-          {"edges", [](const StepRecord& s) { return s.back_end.edges; }},
-          {"clique", [](const StepRecord& s) { return s.back_end.clique; }}};
-}
-
-// The evidence of the steps that had a recognition, accepted or not; empty fields in the others.
-struct EvidenceColumn {
-  std::string name;
-  std::function<double(const Evidence&)> value;
-};
-
-std::vector<EvidenceColumn> EvidenceColumns() {
-  return {{"runner_up", [](const Evidence& e) { return e.runner_up; }},
-          {"expected", [](const Evidence& e) { return e.expected; }},
-          {"supported", [](const Evidence& e) { return e.supported; }},
-          {"overlap", [](const Evidence& e) { return e.overlap; }},
-          {"sigma_m", [](const Evidence& e) { return e.sigma_m; }},
-          {"sigma_rad", [](const Evidence& e) { return e.sigma_rad; }}};
-}
-
-std::vector<double> Values(const std::vector<StepRecord>& steps,
-                           const std::function<double(const StepRecord&)>& value) {
-  std::vector<double> values;
-  values.reserve(steps.size());
-  for (const StepRecord& step : steps) values.push_back(value(step));
-  return values;
-}
-
-double Mean(const std::vector<double>& values) {
-  double sum = 0.0;
-  for (double value : values) sum += value;
-  return sum / static_cast<double>(values.size());  // NaN of nothing
-}
-
-std::vector<double> OptimizationTimes(const std::vector<StepRecord>& steps) {
-  std::vector<double> times_ms;
-  for (const StepRecord& step : steps) {
-    if (step.optimize_ms > 0.0) times_ms.push_back(step.optimize_ms);
-  }
-  return times_ms;
-}
-
-// Name and milliseconds per step of each row of the stage table.
-std::vector<std::pair<std::string, std::vector<double>>> StageTable(const std::vector<StepRecord>& steps) {
-  std::vector<std::pair<std::string, std::vector<double>>> table;
-  for (const std::string& name : StageNames(steps)) {
-    table.emplace_back(name, Values(steps, [&](const StepRecord& step) { return StageMs(step, name); }));
-  }
-  table.emplace_back("total", Values(steps, [](const StepRecord& step) { return step.total_ms; }));
-  table.emplace_back("reading, apart", Values(steps, [](const StepRecord& step) { return step.read_ms; }));
-  table.emplace_back("optimizing, apart", OptimizationTimes(steps));
-  return table;
-}
-
-std::map<std::string, std::size_t> Ends(const std::vector<StepRecord>& steps) {
-  std::map<std::string, std::size_t> ends;
-  for (const StepRecord& step : steps) ++ends[ToString(step.back_end.end)];
-  return ends;
-}
 
 void WriteText(const std::string& path, const std::string& text) {
   std::ofstream file(path);
@@ -123,30 +22,78 @@ void WriteText(const std::string& path, const std::string& text) {
   if (!file) throw std::runtime_error("can't write " + path);
 }
 
-void WriteStepsCsv(const std::vector<StepRecord>& steps, const std::string& path) {
+// Whether a step is a revisit, and in which direction; nothing without ground truth.
+const char* RevisitOf(const EvaluationResult& result, std::size_t step) {
+  if (!result.score) return "";
+  if (!result.score->revisit_targets[step]) return "no";
+  return result.score->opposite[step] ? "opposite" : "same";
+}
+
+const char* ToString(ClosureVerdict verdict) {
+  switch (verdict) {
+    case ClosureVerdict::kTrue:
+      return "true";
+    case ClosureVerdict::kFalse:
+      return "false";
+    case ClosureVerdict::kTrivial:
+      return "trivial";
+    case ClosureVerdict::kUnmatched:
+      return "unmatched";
+  }
+  return "";
+}
+
+// Of the recognition of each step that was judged, accepted or not: whether it is true.
+std::vector<std::string> Verdicts(const EvaluationResult& result) {
+  std::vector<std::string> verdicts(result.steps.size());
+  if (!result.score) return verdicts;
+  for (const JudgedRecognition& recognition : result.recognitions)
+    verdicts[recognition.step] = ToString(recognition.judged.verdict);
+  return verdicts;
+}
+
+void WriteStepsCsv(const EvaluationResult& result, const std::string& path) {
+  const std::vector<StepRecord>& steps = result.steps;
+  const std::vector<std::string> verdicts = Verdicts(result);
   std::ofstream file(path);
   if (!file) throw std::runtime_error("can't write " + path);
   const std::vector<std::string> stages = StageNames(steps);
-  const std::vector<Column> counts = CountColumns();
+  const std::vector<FunnelColumn> counts = FunnelColumns();
   file.precision(6);
   file << "step,stamp,total_ms";
   for (const std::string& stage : stages) file << ',' << stage << "_ms";
   file << ",read_ms,optimize_ms";
   const std::vector<EvidenceColumn> evidence = EvidenceColumns();
-  for (const Column& column : counts) file << ',' << column.name;
+  for (const FunnelColumn& column : counts) file << ',' << column.name;
   for (const EvidenceColumn& column : evidence) file << ',' << column.name;
-  file << ",end\n";
+  file << ",end,revisit,verdict\n";
   for (std::size_t i = 0; i < steps.size(); ++i) {
     const StepRecord& step = steps[i];
     file << i << ',' << FormatSeconds(step.stamp_ns) << ',' << step.total_ms;
     for (const std::string& stage : stages) file << ',' << StageMs(step, stage);
     file << ',' << step.read_ms << ',' << step.optimize_ms;
-    for (const Column& column : counts) file << ',' << static_cast<std::uint64_t>(column.value(step));
+    for (const FunnelColumn& column : counts) file << ',' << static_cast<std::uint64_t>(column.value(step));
     for (const EvidenceColumn& column : evidence) {
       file << ',';
       if (step.back_end.evidence) file << column.value(*step.back_end.evidence);
     }
-    file << ',' << ToString(step.back_end.end) << '\n';
+    file << ',' << ToString(step.back_end.end);
+    file << ',' << RevisitOf(result, i) << ',' << verdicts[i] << '\n';
+  }
+  file.close();
+  if (!file) throw std::runtime_error("writing " + path + " failed: is the disk full?");
+}
+
+void WriteMissedCsv(const EvaluationResult& result, const std::string& path) {
+  std::ofstream file(path);
+  if (!file) throw std::runtime_error("can't write " + path);
+  file << "step,stamp,direction,since_m,nearest_old_step,cause,segments,candidates,edges,clique,clique_needed\n";
+  for (const MissedRevisit& miss : FindMissedRevisits(result)) {
+    const StepRecord& step = result.steps[miss.step];
+    file << miss.step << ',' << FormatSeconds(step.stamp_ns) << ',' << (miss.opposite ? "opposite" : "same") << ','
+         << miss.since_m << ',' << miss.target_step << ',' << miss.cause << ',' << step.front_end.clusters.segments
+         << ',' << step.back_end.candidates << ',' << step.back_end.edges << ',' << step.back_end.clique << ','
+         << result.min_clique << '\n';
   }
   file.close();
   if (!file) throw std::runtime_error("writing " + path + " failed: is the disk full?");
@@ -169,7 +116,26 @@ Json ScoreJson(const Score& score) {
       {"places_opposite", score.places_opposite},
       {"translation_error_m", {{"median", score.translation_error_median_m}, {"p95", score.translation_error_95_m}}},
       {"rotation_error_deg", {{"median", score.rotation_error_median_deg}, {"p95", score.rotation_error_95_deg}}},
-      {"gap_m", {{"p50", score.gap_50_m}, {"p90", score.gap_90_m}, {"p99", score.gap_99_m}, {"max", score.gap_max_m}}}};
+      {"gap_m",
+       {{"p50", score.gap_50_m},
+        {"p90", score.gap_90_m},
+        {"p99", score.gap_99_m},
+        {"max", score.gap_max_m},
+        {"share_within_1_5_m", ShareWithin(score.gaps_m, 1.5)}}}};
+}
+
+// At most about a hundred points of the curve, both ends included.
+Json AcceptanceJson(const std::vector<AcceptancePoint>& curve) {
+  Json points = Json::array();
+  const std::size_t every = std::max<std::size_t>(1, curve.size() / 100);
+  for (std::size_t i = 0; i < curve.size(); ++i) {
+    if (i % every != 0 && i + 1 != curve.size()) continue;
+    points.push_back({{"threshold", curve[i].threshold},
+                      {"accepted", curve[i].accepted},
+                      {"precision", curve[i].precision},
+                      {"recall", curve[i].recall}});
+  }
+  return points;
 }
 
 template <typename... Arguments>
@@ -232,16 +198,23 @@ std::string SummaryJson(const EvaluationResult& result) {
                                   {"bound_same_places", errors.bound_same_places_m},
                                   {"bound_every_revisit", errors.bound_every_revisit_m}};
   }
-  for (const auto& [stage, times_ms] : StageTable(result.steps)) {
-    json["stages_ms"][stage] = {
-        {"median", Percentile(times_ms, 0.5)}, {"p95", Percentile(times_ms, 0.95)}, {"max", Percentile(times_ms, 1.0)}};
+  json["missed_revisits_by"] = CountCauses(FindMissedRevisits(result));
+  json["acceptance_curve"] = AcceptanceJson(AcceptanceCurve(result));
+  for (const ThesisFigure& figure : CompareWithThesis(result)) json["thesis_figures"][figure.key] = figure.ours;
+  for (const StageStatistics& stage : MeasureStages(result.steps)) {
+    json["stages_ms"][stage.name] = {{"mean", stage.mean_ms},
+                                     {"median", stage.median_ms},
+                                     {"p95", stage.p95_ms},
+                                     {"p99", stage.p99_ms},
+                                     {"max", stage.max_ms}};
   }
-  for (const Column& column : CountColumns()) {
+  json["clique_needed"] = result.min_clique;
+  for (const FunnelColumn& column : FunnelColumns()) {
     const std::vector<double> values = Values(result.steps, column.value);
     json["counts"][column.name] = {
         {"mean", Mean(values)}, {"median", Percentile(values, 0.5)}, {"max", Percentile(values, 1.0)}};
   }
-  json["steps_ended_by"] = Ends(result.steps);
+  json["steps_ended_by"] = CountEnds(result.steps);
   return json.dump(2) + "\n";
 }
 
@@ -255,15 +228,20 @@ std::string FormatSummary(const EvaluationResult& result) {
   text += result.score ? FormatScore(*result.score) : "no ground truth: nothing is scored\n";
   if (result.trajectory_error) text += FormatErrors(*result.trajectory_error);
   text += "steps ended by     ";
-  for (const auto& [end, count] : Ends(result.steps)) text += " " + end + Format(" %zu", count);
+  for (const auto& [end, count] : CountEnds(result.steps)) text += " " + end + Format(" %zu", count);
+  if (result.score) {
+    text += "\nmissed revisits by ";
+    for (const auto& [cause, count] : CountCauses(FindMissedRevisits(result)))
+      text += " " + cause + Format(" %zu", count);
+  }
   const std::vector<double> segments =
       Values(result.steps, [](const StepRecord& step) { return step.front_end.clusters.segments; });
   text += "\nsegments            " + Number(Mean(segments), "%.1f") + " in a local map (mean)\n\n";
-  text += Format("%-20s %9s %9s %9s\n", "stage, ms", "median", "95 %", "max");
-  for (const auto& [stage, times_ms] : StageTable(result.steps)) {
-    text +=
-        Format("%-20s %9s %9s %9s\n", stage.c_str(), Number(Percentile(times_ms, 0.5), "%.3f").c_str(),
-               Number(Percentile(times_ms, 0.95), "%.3f").c_str(), Number(Percentile(times_ms, 1.0), "%.3f").c_str());
+  text += Format("%-20s %9s %9s %9s %9s\n", "stage, ms", "median", "95 %", "99 %", "max");
+  for (const StageStatistics& stage : MeasureStages(result.steps)) {
+    text += Format("%-20s %9s %9s %9s %9s\n", stage.name.c_str(), Number(stage.median_ms, "%.3f").c_str(),
+                   Number(stage.p95_ms, "%.3f").c_str(), Number(stage.p99_ms, "%.3f").c_str(),
+                   Number(stage.max_ms, "%.3f").c_str());
   }
   return text;
 }
@@ -273,12 +251,14 @@ void WriteResults(const EvaluationResult& result, const EvaluationParameters& pa
   std::filesystem::create_directories(folder, error);
   if (error) throw std::runtime_error("can't make the folder " + folder + ": " + error.message());
   WriteClosuresCsv(result.closures, folder + "/closures.csv");
-  WriteStepsCsv(result.steps, folder + "/steps.csv");
+  WriteStepsCsv(result, folder + "/steps.csv");
+  if (result.score) WriteMissedCsv(result, folder + "/missed.csv");
   WriteTum(result.odometry, folder + "/trajectory_odometry.tum");
   WriteTum(result.optimized, folder + "/trajectory_optimized.tum");
   if (result.pose_graph) WriteG2o(*result.pose_graph, folder + "/pose_graph.g2o");
   WriteText(folder + "/parameters.yaml", ToYaml(parameters.core));
   WriteText(folder + "/summary.json", SummaryJson(result));
+  WriteText(folder + "/report.html", ReportHtml(result));
 }
 
 }  // namespace incremental_segmatch

@@ -21,9 +21,11 @@ double Ratio(std::size_t part, std::size_t whole) {
 // The true drive: seconds, positions and path lengths per step.
 class Truth {
  public:
-  Truth(const std::vector<StampNs>& stamps_ns, const std::vector<Pose>& T_world_sensor) : poses_(T_world_sensor) {
+  explicit Truth(const TrueTrajectory& drive) : poses_(drive.T_world_sensor) {
+    if (drive.stamps_ns.size() != poses_.size())
+      throw std::invalid_argument("scoring needs one true pose for each stamp");
     for (std::size_t i = 0; i < poses_.size(); ++i) {
-      seconds_.push_back(static_cast<double>(stamps_ns[i]) / 1e9);
+      seconds_.push_back(static_cast<double>(drive.stamps_ns[i]) / 1e9);
       path_m_.push_back(i == 0 ? 0.0 : path_m_[i - 1] + (position(i) - position(i - 1)).norm());
     }
     std::vector<double> periods;
@@ -58,55 +60,76 @@ class Truth {
   double half_period_s_ = 0.05;
 };
 
-// For each step the nearest pose that is older by more than the limits, if within the radius; of several at the same
-// distance the oldest.
-std::vector<std::optional<std::size_t>> FindRevisits(const Truth& truth, const ScoringParameters& parameters) {
-  const double radius_m = parameters.revisit_radius_m;
-  const auto cell = [&](std::size_t i, int dx, int dy) {
-    const auto column = static_cast<std::int64_t>(std::floor(truth.position(i).x() / radius_m)) + dx;
-    const auto row = static_cast<std::int64_t>(std::floor(truth.position(i).y() / radius_m)) + dy;
-    return column * (std::int64_t{1} << 32) + row;
-  };
-  std::unordered_map<std::int64_t, std::vector<std::size_t>> old_poses;
-  std::vector<std::optional<std::size_t>> revisits(truth.size());
-  std::size_t next = 0;
-  for (std::size_t i = 0; i < truth.size(); ++i) {
-    for (; next < i && truth.seconds(i) - truth.seconds(next) > parameters.min_age_s; ++next) {
-      old_poses[cell(next, 0, 0)].push_back(next);
-    }
-    std::pair<double, std::size_t> nearest{std::numeric_limits<double>::infinity(), 0};
-    for (int dx = -1; dx <= 1; ++dx) {
-      for (int dy = -1; dy <= 1; ++dy) {
-        const auto it = old_poses.find(cell(i, dx, dy));
-        if (it == old_poses.end()) continue;
-        for (std::size_t k : it->second) {
-          if (truth.path_m(i) - truth.path_m(k) <= parameters.min_path_m) continue;
-          nearest = std::min(nearest, {(truth.position(i) - truth.position(k)).norm(), k});
+// What closures refer to: the older part of the drive itself, or another drive.
+class Targets {
+ public:
+  Targets(const Truth& drive, const Truth& targets, const ScoringParameters& parameters)
+      : drive_(drive), targets_(targets), is_same_drive_(&drive == &targets), parameters_(parameters) {}
+
+  const Truth& truth() const { return targets_; }
+
+  // True if a pose is a target of step i.
+  bool IsOld(std::size_t i, std::size_t target) const {
+    return !is_same_drive_ || (drive_.seconds(i) - drive_.seconds(target) > parameters_.min_age_s &&
+                               drive_.path_m(i) - drive_.path_m(target) > parameters_.min_path_m);
+  }
+
+  // For each step the nearest target, if within the radius; of several at the same distance the oldest.
+  std::vector<std::optional<std::size_t>> FindRevisits() const {
+    std::unordered_map<std::int64_t, std::vector<std::size_t>> old_poses;
+    std::vector<std::optional<std::size_t>> revisits(drive_.size());
+    std::size_t next = 0;
+    for (std::size_t i = 0; i < drive_.size(); ++i) {
+      const auto is_old_enough = [&](std::size_t k) {
+        return !is_same_drive_ || (k < i && drive_.seconds(i) - drive_.seconds(k) > parameters_.min_age_s);
+      };
+      for (; next < targets_.size() && is_old_enough(next); ++next)
+        old_poses[Cell(targets_.position(next), 0, 0)].push_back(next);
+      std::pair<double, std::size_t> nearest{std::numeric_limits<double>::infinity(), 0};
+      for (int dx = -1; dx <= 1; ++dx) {
+        for (int dy = -1; dy <= 1; ++dy) {
+          const auto it = old_poses.find(Cell(drive_.position(i), dx, dy));
+          if (it == old_poses.end()) continue;
+          for (std::size_t k : it->second) {
+            if (IsOld(i, k)) nearest = std::min(nearest, {(drive_.position(i) - targets_.position(k)).norm(), k});
+          }
         }
       }
+      if (nearest.first <= parameters_.revisit_radius_m) revisits[i] = nearest.second;
     }
-    if (nearest.first <= radius_m) revisits[i] = nearest.second;
+    return revisits;
   }
-  return revisits;
-}
+
+ private:
+  std::int64_t Cell(const Eigen::Vector3d& position, int dx, int dy) const {
+    const auto column = static_cast<std::int64_t>(std::floor(position.x() / parameters_.revisit_radius_m)) + dx;
+    const auto row = static_cast<std::int64_t>(std::floor(position.y() / parameters_.revisit_radius_m)) + dy;
+    return column * (std::int64_t{1} << 32) + row;
+  }
+
+  const Truth& drive_;
+  const Truth& targets_;
+  bool is_same_drive_;
+  const ScoringParameters& parameters_;
+};
 
 bool IsOpposite(const Pose& T_world_a, const Pose& T_world_b) {
   return T_world_a.linear().col(0).dot(T_world_b.linear().col(0)) < 0.0;
 }
 
-JudgedClosure Judge(const Truth& truth, const ClosureRow& closure, const ScoringParameters& parameters) {
+JudgedClosure Judge(const Truth& drive, const Targets& targets, const ClosureRow& closure,
+                    const ScoringParameters& parameters) {
   JudgedClosure judged;
-  const std::optional<std::size_t> query = truth.Find(closure.stamp_query_ns);
-  const std::optional<std::size_t> target = truth.Find(closure.stamp_target_ns);
+  const std::optional<std::size_t> query = drive.Find(closure.stamp_query_ns);
+  const std::optional<std::size_t> target = targets.truth().Find(closure.stamp_target_ns);
   if (!query || !target) return judged;
   judged.query_step = *query;
   judged.target_step = *target;
-  if (!(truth.seconds(*query) - truth.seconds(*target) > parameters.min_age_s &&
-        truth.path_m(*query) - truth.path_m(*target) > parameters.min_path_m)) {
+  if (!targets.IsOld(*query, *target)) {
     judged.verdict = ClosureVerdict::kTrivial;
     return judged;
   }
-  const Pose error = (truth.pose(*target).inverse() * truth.pose(*query)).inverse() * closure.T_target_query;
+  const Pose error = (targets.truth().pose(*target).inverse() * drive.pose(*query)).inverse() * closure.T_target_query;
   judged.translation_error_m = error.translation().norm();
   const double cosine = std::clamp((error.linear().trace() - 1.0) / 2.0, -1.0, 1.0);
   judged.rotation_error_deg = std::acos(cosine) * kDegreesPerRadian;
@@ -116,36 +139,24 @@ JudgedClosure Judge(const Truth& truth, const ClosureRow& closure, const Scoring
   return judged;
 }
 
-}  // namespace
-
-double Percentile(std::vector<double> values, double share) {
-  if (values.empty()) return std::numeric_limits<double>::quiet_NaN();
-  std::sort(values.begin(), values.end());
-  const auto index = static_cast<std::size_t>(share * static_cast<double>(values.size()));
-  return values[std::min(index, values.size() - 1)];
-}
-
-Score ScoreClosures(const std::vector<StampNs>& stamps_ns, const std::vector<Pose>& T_world_sensor,
-                    const std::vector<ClosureRow>& closures, const ScoringParameters& parameters) {
-  if (stamps_ns.size() != T_world_sensor.size()) {
-    throw std::invalid_argument("scoring needs one true pose for each stamp");
-  }
-  const Truth truth(stamps_ns, T_world_sensor);
+Score ScoreAgainst(const Truth& truth, const Targets& old, const std::vector<ClosureRow>& closures,
+                   const ScoringParameters& parameters) {
   Score score;
   score.steps = truth.size();
-  score.revisit_targets = FindRevisits(truth, parameters);
+  score.revisit_targets = old.FindRevisits();
+  score.found.assign(truth.size(), false);
+  score.opposite.assign(truth.size(), false);
 
-  std::vector<bool> found(truth.size(), false);
   std::vector<double> translation_errors, rotation_errors;
   for (const ClosureRow& closure : closures) {
-    const JudgedClosure judged = Judge(truth, closure, parameters);
+    const JudgedClosure judged = Judge(truth, old, closure, parameters);
     score.judged.push_back(judged);
     score.unmatched_closures += judged.verdict == ClosureVerdict::kUnmatched;
     score.trivial_closures += judged.verdict == ClosureVerdict::kTrivial;
     score.false_closures += judged.verdict == ClosureVerdict::kFalse;
     if (judged.verdict != ClosureVerdict::kTrue) continue;
     ++score.true_closures;
-    found[judged.query_step] = true;
+    score.found[judged.query_step] = true;
     translation_errors.push_back(judged.translation_error_m);
     rotation_errors.push_back(judged.rotation_error_deg);
   }
@@ -153,7 +164,7 @@ Score ScoreClosures(const std::vector<StampNs>& stamps_ns, const std::vector<Pos
   score.precision = Ratio(score.true_closures, score.closures);
 
   std::size_t found_same = 0, found_opposite = 0;
-  std::vector<double> gaps;
+  std::vector<double>& gaps = score.gaps_m;
   const auto& targets = score.revisit_targets;
   for (std::size_t i = 0; i < truth.size();) {
     if (!targets[i]) {
@@ -163,10 +174,11 @@ Score ScoreClosures(const std::vector<StampNs>& stamps_ns, const std::vector<Pos
     double mark_m = truth.path_m(i);
     bool is_place = false, is_opposite_place = false;
     for (; i < truth.size() && targets[i]; ++i) {
-      const bool opposite = IsOpposite(truth.pose(i), truth.pose(*targets[i]));
+      const bool opposite = IsOpposite(truth.pose(i), old.truth().pose(*targets[i]));
+      score.opposite[i] = opposite;
       ++score.revisits;
       score.revisits_opposite += opposite;
-      if (!found[i]) continue;
+      if (!score.found[i]) continue;
       ++(opposite ? found_opposite : found_same);
       is_place = true;
       is_opposite_place = is_opposite_place || opposite;
@@ -189,6 +201,32 @@ Score ScoreClosures(const std::vector<StampNs>& stamps_ns, const std::vector<Pos
   score.gap_99_m = Percentile(gaps, 0.99);
   score.gap_max_m = Percentile(gaps, 1.0);
   return score;
+}
+
+}  // namespace
+
+double Percentile(std::vector<double> values, double share) {
+  if (values.empty()) return std::numeric_limits<double>::quiet_NaN();
+  std::sort(values.begin(), values.end());
+  const auto index = static_cast<std::size_t>(share * static_cast<double>(values.size()));
+  return values[std::min(index, values.size() - 1)];
+}
+
+double ShareWithin(const std::vector<double>& values, double limit) {
+  const auto within = std::count_if(values.begin(), values.end(), [&](double value) { return value <= limit; });
+  return Ratio(static_cast<std::size_t>(within), values.size());
+}
+
+Score ScoreClosures(const TrueTrajectory& drive, const std::vector<ClosureRow>& closures,
+                    const ScoringParameters& parameters) {
+  const Truth truth(drive);
+  return ScoreAgainst(truth, Targets(truth, truth, parameters), closures, parameters);
+}
+
+Score ScoreLocalizations(const TrueTrajectory& drive, const TrueTrajectory& map_drive,
+                         const std::vector<ClosureRow>& closures, const ScoringParameters& parameters) {
+  const Truth truth(drive), map_truth(map_drive);
+  return ScoreAgainst(truth, Targets(truth, map_truth, parameters), closures, parameters);
 }
 
 void WriteClosuresCsv(const std::vector<ClosureRow>& closures, const std::string& path) {

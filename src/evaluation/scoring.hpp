@@ -26,6 +26,12 @@ struct ClosureRow {
 /// Writes closures.csv: stamps in seconds with nine decimals. Throws std::runtime_error naming the file.
 void WriteClosuresCsv(const std::vector<ClosureRow>& closures, const std::string& path);
 
+/// The true poses of a drive's sensor.
+struct TrueTrajectory {
+  std::vector<StampNs> stamps_ns;    ///< of the scans, increasing
+  std::vector<Pose> T_world_sensor;  ///< one for each stamp
+};
+
 /// The terms of the score.
 struct ScoringParameters {
   double min_age_s = 60.0;         ///< a closure's target is more than this older than its query
@@ -74,17 +80,29 @@ struct Score {
   double gap_90_m = 0.0;
   double gap_99_m = 0.0;
   double gap_max_m = 0.0;
+  std::vector<double> gaps_m;         ///< all of them, in the order of the drive: the curve of thesis fig. 4.8
   std::size_t places = 0;             ///< stretches of revisited path with at least one true closure
   std::size_t places_opposite = 0;    ///< of those, with one in the opposite direction
   std::vector<JudgedClosure> judged;  ///< one for each row given
   std::vector<std::optional<std::size_t>>
-      revisit_targets;  ///< per step: the nearest pose that is old enough, if within the radius
+      revisit_targets;         ///< per step: the nearest pose that is old enough, if within the radius
+  std::vector<bool> opposite;  ///< per step: a revisit in the opposite direction
+  std::vector<bool> found;     ///< per step: has a true closure
 };
 
-/// Judges closures against the true poses of the sensor at the scans' stamps (increasing; both of the same size). O(n)
+/// Judges closures of a drive with itself. Throws std::invalid_argument unless there is one pose for each stamp. O(n)
 /// for drives of bounded density.
-Score ScoreClosures(const std::vector<StampNs>& stamps_ns, const std::vector<Pose>& T_world_sensor,
-                    const std::vector<ClosureRow>& closures, const ScoringParameters& parameters);
+Score ScoreClosures(const TrueTrajectory& drive, const std::vector<ClosureRow>& closures,
+                    const ScoringParameters& parameters);
+
+/// Judges localizations of a drive in the map of another one, whose truth is in the same world frame. Targets are the
+/// map drive's poses, on its clock; every step within the radius of one of them is a revisit, and no closure is
+/// trivial. Otherwise as ScoreClosures.
+Score ScoreLocalizations(const TrueTrajectory& drive, const TrueTrajectory& map_drive,
+                         const std::vector<ClosureRow>& closures, const ScoringParameters& parameters);
+
+/// Share of the values that are at most `limit`; NaN of nothing.
+double ShareWithin(const std::vector<double>& values, double limit);
 
 /// The value below which the given share (0..1) of the values lie: the one at floor(share * n) in order; NaN of
 /// nothing.

@@ -7,19 +7,25 @@
 
 namespace incremental_segmatch {
 
-double AbsoluteTrajectoryError(const std::vector<Pose>& estimate, const std::vector<Pose>& truth) {
+Pose AlignTrajectory(const std::vector<Pose>& estimate, const std::vector<Pose>& truth) {
   if (estimate.size() != truth.size()) {
     throw std::invalid_argument("the trajectory error needs as many estimated as true poses");
   }
-  if (estimate.empty()) return std::numeric_limits<double>::quiet_NaN();
   Eigen::Matrix3Xd from(3, estimate.size()), to(3, truth.size());
   for (std::size_t i = 0; i < truth.size(); ++i) {
     from.col(static_cast<Eigen::Index>(i)) = estimate[i].translation();
     to.col(static_cast<Eigen::Index>(i)) = truth[i].translation();
   }
-  const Eigen::Matrix4d T = Eigen::umeyama(from, to, false);
-  const Eigen::Matrix3Xd aligned = (T.topLeftCorner<3, 3>() * from).colwise() + T.topRightCorner<3, 1>();
-  return std::sqrt((aligned - to).colwise().squaredNorm().mean());
+  return Pose(Eigen::umeyama(from, to, false));
+}
+
+double AbsoluteTrajectoryError(const std::vector<Pose>& estimate, const std::vector<Pose>& truth) {
+  if (estimate.empty() && truth.empty()) return std::numeric_limits<double>::quiet_NaN();
+  const Pose T = AlignTrajectory(estimate, truth);
+  double sum_m2 = 0.0;
+  for (std::size_t i = 0; i < truth.size(); ++i)
+    sum_m2 += (T * estimate[i].translation() - truth[i].translation()).squaredNorm();
+  return std::sqrt(sum_m2 / static_cast<double>(truth.size()));
 }
 
 std::vector<Pose> PosesOf(const std::vector<StampedPose>& trajectory) {

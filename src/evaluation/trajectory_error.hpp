@@ -9,6 +9,10 @@
 
 namespace incremental_segmatch {
 
+/// The rigid transform (Umeyama, no scale) that brings the positions of `estimate` nearest to those of `truth`. Both of
+/// the same size (else std::invalid_argument) and not empty.
+Pose AlignTrajectory(const std::vector<Pose>& estimate, const std::vector<Pose>& truth);
+
 /// Absolute trajectory error: root mean square of the distances between corresponding positions after the rigid
 /// alignment (Umeyama, no scale) that makes it least, in metres. Both of the same size (else std::invalid_argument);
 /// NaN without poses.

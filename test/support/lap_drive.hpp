@@ -68,7 +68,7 @@ inline PipelineRun Process(const Drive& drive, BackEnd* back_end, const FrontEnd
 }
 
 inline Score ScoreRun(const Drive& drive, const PipelineRun& run) {
-  return ScoreClosures(drive.stamps_ns, drive.T_world_sensor, run.closures, ScoringParameters());
+  return ScoreClosures({drive.stamps_ns, drive.T_world_sensor}, run.closures, ScoringParameters());
 }
 
 }  // namespace incremental_segmatch::test

@@ -165,5 +165,68 @@ TEST_F(Drive, SimulatedOnTheFly) {
   EXPECT_HAS(run.output, "8 steps of simulated drive along route lap");
 }
 
+TEST_F(Drive, SimulationTakesTheOptionsOfSimulate) {
+  const std::string options =
+      " --route lap --laps 1 --first-frame 7 --max-scans 4 --stride 3 --drift 0 --noise 0.01 --grade 0 ";
+  const Outcome run = Segmatch("evaluate --simulate --sensor VLP-16" + options + "--out " + Out("result"));
+  ASSERT_EQ(run.status, 0) << run.output;
+  EXPECT_HAS(run.output, "4 steps of simulated drive");
+  const Outcome written = Segmatch("simulate --sensor VLP-16" + options + "--out " + Out("drive"));
+  ASSERT_EQ(written.status, 0) << written.output;
+  const Outcome again =
+      Segmatch("evaluate --kitti " + Out("drive") + " --sequence 00 --odometry odometry.txt --out " + Out("again"));
+  ASSERT_EQ(again.status, 0) << again.output;
+  std::ifstream first(Out("result/summary.json")), second(Out("again/summary.json"));
+  const nlohmann::json a = nlohmann::json::parse(first), b = nlohmann::json::parse(second);
+  EXPECT_EQ(a["counts"]["points"], b["counts"]["points"]);
+  EXPECT_EQ(a["counts"]["segments"], b["counts"]["segments"]);
+  EXPECT_NEAR(a["trajectory_error_m"]["odometry"].get<double>(), 0.0, 1e-6) << "no drift was asked for";
+  EXPECT_NE(Segmatch("evaluate --kitti x --sequence 00 --laps 2 --out x").status, 0);
+}
+
+TEST_F(Drive, LocalizationNeedsAMapAndAMapLocalization) {
+  const Outcome no_map = Segmatch("evaluate " + Kitti() + " --mode localization --out " + Out("result"));
+  EXPECT_EQ(no_map.status, 1);
+  EXPECT_HAS(no_map.output, "map");
+  ASSERT_EQ(Segmatch("evaluate " + Kitti() + " --save-map " + Out("map") + " --out " + Out("first")).status, 0);
+  EXPECT_EQ(Lines(Out("map.truth.tum")).size(), 6u);
+  EXPECT_EQ(
+      Segmatch("evaluate " + Kitti() + " --map " + Out("map") + " --mode loop_closure --out " + Out("second")).status,
+      1);
+  const Outcome run =
+      Segmatch("evaluate " + Kitti() + " --map " + Out("map") + " --mode localization --out " + Out("second"));
+  ASSERT_EQ(run.status, 0) << run.output;
+  std::ifstream file(Out("second/summary.json"));
+  const nlohmann::json summary = nlohmann::json::parse(file);
+  EXPECT_EQ(summary["score"]["revisits"], 6) << "every scan is where the map was made";
+  EXPECT_TRUE(summary["trajectory_error_m"].is_null());
+  EXPECT_EQ(Lines(Out("second/missed.csv")).size(), 7u) << "and too empty to be recognised";
+  std::filesystem::remove(Out("map.truth.tum"));
+  const Outcome unjudged =
+      Segmatch("evaluate " + Kitti() + " --map " + Out("map") + " --mode localization --out " + Out("third"));
+  EXPECT_HAS(unjudged.output, "nothing is scored");
+  const Outcome with_kitti =
+      Segmatch("evaluate " + Kitti() + " --map " + Out("map") + " --mode localization --map-kitti " +
+               directory_.path() + " --map-sequence 07 --out " + Out("fourth"));
+  EXPECT_HAS(with_kitti.output, "of 6 revisits");
+}
+
+TEST_F(Drive, MatrixGathersRuns) {
+  const std::string call =
+      "experiment matrix --drives lap:0:3 lap:20:2 --seeds 4 9 --sensor VLP-16 --jobs 2 --out " + Out("matrix");
+  const Outcome run = Segmatch(call);
+  ASSERT_EQ(run.status, 0) << run.output;
+  std::ifstream file(Out("matrix/matrix.json"));
+  const nlohmann::json table = nlohmann::json::parse(file);
+  EXPECT_EQ(table["lap_0_3"]["runs"], 2);
+  EXPECT_EQ(table["lap_20_2"]["steps"]["mean"], 2.0);
+  EXPECT_EQ(table["all"]["runs"], 4);
+  EXPECT_TRUE(std::filesystem::exists(Out("matrix/lap_20_2_seed9/report.html")));
+  EXPECT_HAS(Segmatch(call + " --resume").output, "is there already");
+  const Outcome unknown = Segmatch("experiment matrix --drives nowhere --out " + Out("x"));
+  EXPECT_EQ(unknown.status, 1);
+  EXPECT_HAS(unknown.output, "nowhere");
+}
+
 }  // namespace
 }  // namespace incremental_segmatch

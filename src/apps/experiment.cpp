@@ -1,0 +1,204 @@
+#include "apps/experiment.hpp"
+
+#include <algorithm>
+#include <atomic>
+#include <cstdio>
+#include <filesystem>
+#include <fstream>
+#include <memory>
+#include <mutex>
+#include <stdexcept>
+#include <string>
+#include <thread>
+#include <vector>
+
+#include "apps/simulated_drive.hpp"
+#include "apps/simulation_options.hpp"
+#include "evaluation/evaluation.hpp"
+#include "evaluation/run_table.hpp"
+
+namespace incremental_segmatch::apps {
+namespace {
+
+namespace fs = std::filesystem;
+
+struct MatrixArguments {
+  SimulationArguments simulation;
+  std::vector<std::string> drives;
+  std::vector<std::uint64_t> seeds{1, 2, 3};
+  std::string config;
+  std::string out;
+  unsigned jobs = 1;
+  bool resume = false;
+  bool no_optimization = false;
+};
+
+// A drive as the command line names it: ROUTE or POSES_FILE, then :FIRST:COUNT for a part of it.
+struct DriveName {
+  std::string name;  ///< of its folders
+  std::string route;
+  std::string poses_file;
+  std::size_t first_frame = 0;
+  std::size_t max_scans = 0;
+};
+
+std::size_t ParseCount(const std::string& word, const std::string& drive) {
+  std::size_t used = 0;
+  unsigned long count = 0;
+  try {
+    count = std::stoul(word, &used);
+  } catch (const std::exception&) {
+    used = 0;
+  }
+  if (word.empty() || used != word.size()) {
+    throw std::invalid_argument("drive " + drive + ": expected ROUTE, FILE, or either with :FIRST_FRAME:SCANS");
+  }
+  return count;
+}
+
+DriveName ParseDrive(const std::string& text) {
+  std::vector<std::string> words{""};
+  for (const char c : text) {
+    if (c == ':') {
+      words.emplace_back();
+    } else {
+      words.back() += c;
+    }
+  }
+  if (words.size() > 3) throw std::invalid_argument("drive " + text + ": expected at most two colons");
+  DriveName drive;
+  const std::vector<std::string> routes = simulator::PresetRouteNames();
+  if (std::find(routes.begin(), routes.end(), words[0]) != routes.end()) {
+    drive.route = drive.name = words[0];
+  } else if (fs::exists(words[0])) {
+    drive.poses_file = words[0];
+    drive.name = fs::path(words[0]).stem().string();
+  } else {
+    throw std::invalid_argument("drive " + text + " is neither a preset route nor a pose file that exists");
+  }
+  if (words.size() > 1) drive.first_frame = ParseCount(words[1], text);
+  if (words.size() > 2) drive.max_scans = ParseCount(words[2], text);
+  for (std::size_t i = 1; i < words.size(); ++i) drive.name += "_" + words[i];
+  return drive;
+}
+
+struct Run {
+  std::string folder;
+  std::string name;
+  simulator::SimulationOptions simulation;
+};
+
+void Evaluate(const Run& run, const EvaluationParameters& parameters, std::string* words) {
+  SimulatedDrive drive(run.simulation);
+  const EvaluationResult result = incremental_segmatch::Evaluate(drive, parameters);
+  WriteResults(result, parameters, run.folder);
+  const Score& score = *result.score;
+  char text[200];
+  std::snprintf(text, sizeof text, "%zu steps, %zu true, %zu false, recall %.3f of %zu, %.0f s", result.steps.size(),
+                score.true_closures, score.false_closures, score.recall, score.revisits, result.seconds);
+  *words = text;
+}
+
+// Runs them on some threads. A run that fails does not end the others; what failed is said, and thrown in the end.
+void EvaluateAll(const std::vector<Run>& runs, const EvaluationParameters& parameters, unsigned jobs, bool resume) {
+  std::atomic<std::size_t> next{0};
+  std::mutex printing;
+  std::size_t done = 0, failed = 0;
+  const auto work = [&] {
+    for (std::size_t i = next++; i < runs.size(); i = next++) {
+      std::string words;
+      bool ok = true;
+      try {
+        if (resume && fs::exists(runs[i].folder + "/summary.json")) {
+          words = "is there already";
+        } else {
+          Evaluate(runs[i], parameters, &words);
+        }
+      } catch (const std::exception& error) {
+        words = std::string("failed: ") + error.what();
+        ok = false;
+      }
+      const std::lock_guard<std::mutex> lock(printing);
+      failed += !ok;
+      std::printf("[%zu/%zu] %s: %s\n", ++done, runs.size(), runs[i].name.c_str(), words.c_str());
+      std::fflush(stdout);
+    }
+  };
+  std::vector<std::thread> threads;
+  for (unsigned i = 1; i < std::min<std::size_t>(jobs, runs.size()); ++i) threads.emplace_back(work);
+  work();
+  for (std::thread& thread : threads) thread.join();
+  if (failed > 0)
+    throw std::runtime_error(std::to_string(failed) + " of " + std::to_string(runs.size()) + " runs failed");
+}
+
+void WriteText(const std::string& path, const std::string& text) {
+  std::ofstream file(path);
+  file << text;
+  file.close();
+  if (!file) throw std::runtime_error("can't write " + path);
+}
+
+void RunMatrix(const MatrixArguments& arguments) {
+  EvaluationParameters parameters;
+  if (!arguments.config.empty()) parameters.core = LoadParameters(arguments.config);
+  parameters.optimize = !arguments.no_optimization;
+  std::vector<Run> runs;
+  std::vector<RunGroup> groups;
+  for (const std::string& text : arguments.drives) {
+    const DriveName drive = ParseDrive(text);
+    groups.push_back({drive.name, {}});
+    for (const std::uint64_t seed : arguments.seeds) {
+      Run run;
+      run.name = drive.name + " seed " + std::to_string(seed);
+      run.folder = arguments.out + "/" + drive.name + "_seed" + std::to_string(seed);
+      run.simulation = arguments.simulation.Resolve();
+      run.simulation.route = drive.route;
+      run.simulation.poses_file = drive.poses_file;
+      run.simulation.first_frame = drive.first_frame;
+      run.simulation.max_scans = drive.max_scans;
+      run.simulation.seed = seed;
+      runs.push_back(run);
+      groups.back().summaries.push_back(run.folder + "/summary.json");
+    }
+  }
+  EvaluateAll(runs, parameters, arguments.jobs, arguments.resume);
+  const std::string table = RunTableMarkdown(groups);
+  WriteText(arguments.out + "/matrix.md", table);
+  WriteText(arguments.out + "/matrix.json", RunTableJson(groups));
+  std::printf("\n%s\nwritten to %s: matrix.md matrix.json, and a folder for each run with its report.html\n",
+              table.c_str(), arguments.out.c_str());
+}
+
+void AddMatrixCommand(CLI::App& experiment) {
+  const auto arguments = std::make_shared<MatrixArguments>();
+  CLI::App* command = experiment.add_subcommand(
+      "matrix",
+      "Evaluate several simulated drives with several seeds each, simulating on the fly, and gather mean and range "
+      "per\n"
+      "drive in one table.\n\n"
+      "  segmatch experiment matrix --drives opposite deceptive kitti/05.txt kitti/06.txt:0:600 --stride 2 --out "
+      "result\n\n"
+      "A drive is a preset route or a KITTI pose file, of which :FIRST_FRAME:SCANS takes a part.\n");
+  command->add_option("--drives", arguments->drives, "what to drive")->required();
+  command->add_option("--seeds", arguments->seeds, "of town, noise and drift")->capture_default_str();
+  command->add_option("--out", arguments->out, "folder to write into; made if need be")->required();
+  command->add_option("--config", arguments->config, "YAML with parameters that differ from the defaults");
+  command->add_option("--jobs", arguments->jobs, "runs at a time; their times are worth less then")
+      ->check(CLI::PositiveNumber)
+      ->capture_default_str();
+  command->add_flag("--resume", arguments->resume, "keep what runs of an earlier call have left in the folder");
+  command->add_flag("--no-optimization", arguments->no_optimization, "recognitions only: no pose graph");
+  AddSensorOptions(*command, &arguments->simulation);
+  command->callback([arguments] { RunMatrix(*arguments); });
+}
+
+}  // namespace
+
+void AddExperimentCommand(CLI::App& app) {
+  CLI::App* command = app.add_subcommand("experiment", "Sets of runs on simulated drives, in one table.");
+  command->require_subcommand(1);
+  AddMatrixCommand(*command);
+}
+
+}  // namespace incremental_segmatch::apps
