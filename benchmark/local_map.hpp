@@ -60,8 +60,6 @@ class BatchOnGrid : public GridMap {
     BatchBaselineParameters parameters;
     parameters.local_radius_m = setup.local_radius_m;
     parameters.normal_radius_m = NormalsParameters{}.radius_m;
-    parameters.max_normal_angle_rad = SmoothnessParameters{}.max_angle_rad;
-    parameters.max_seed_curvature = SmoothnessParameters{}.max_curvature;
     return parameters;
   }
 

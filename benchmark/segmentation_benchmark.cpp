@@ -120,8 +120,6 @@ class SmoothMap : public GridMap {
   /// Adjusted Rand index over the voxels that are in a segment of both: 1 for the same partition, 0 for chance.
   double AgreementWithPcl() const {
     BatchBaselineParameters parameters;
-    parameters.max_normal_angle_rad = SmoothnessParameters{}.max_angle_rad;
-    parameters.max_seed_curvature = SmoothnessParameters{}.max_curvature;
     BatchBaseline batch(parameters);
     batch.SetLocalCloud(LocalCloud(), Eigen::Vector3d::Zero());
     batch.EstimateNormals();

@@ -87,12 +87,14 @@ const char* ToString(StepEnd end) {
   return "unknown";
 }
 
-BackEnd::BackEnd(const BackEndParameters& parameters) : BackEnd(parameters, TargetMap(parameters.target_map)) {
+BackEnd::BackEnd(const BackEndParameters& parameters, RecognizeFunction recognize)
+    : BackEnd(parameters, TargetMap(parameters.target_map), std::move(recognize)) {
   if (parameters.mode == Mode::kLocalization)
     throw std::invalid_argument("back_end.mode: localization needs a map; load one, or use loop_closure");
 }
 
-BackEnd::BackEnd(const BackEndParameters& parameters, TargetMap map) : parameters_(parameters), map_(std::move(map)) {
+BackEnd::BackEnd(const BackEndParameters& parameters, TargetMap map, RecognizeFunction recognize)
+    : parameters_(parameters), recognize_(std::move(recognize)), map_(std::move(map)) {
   const MatchingParameters& matching = parameters.matching;
   if (matching.nearest < 0) throw std::invalid_argument("back_end.matching.nearest: must not be negative");
   if (!(matching.max_distance >= 0.0)) throw std::invalid_argument("back_end.matching.max_distance: must not be negative");
@@ -157,7 +159,7 @@ BackEndStep BackEnd::Process(const SegmentDelta& delta) {
   for (const auto& [frame, correspondences] : by_frame) {
     step.counts.candidates += correspondences.size();
     for (const Correspondence& c : correspondences)
-      step.candidates.push_back({c.local, c.target, c.centroid_local, c.centroid_target});
+      step.candidates.push_back({c.local, c.target, c.centroid_local, c.centroid_target, c.descriptor_distance});
   }
   if (robots_[robot].local.empty()) {
     step.counts.end = StepEnd::kNoSegments;
@@ -359,8 +361,9 @@ std::map<RobotIndex, Correspondences> BackEnd::CollectCorrespondences(RobotIndex
 RecognizerResult BackEnd::Recognize(RobotIndex robot, const std::map<RobotIndex, Correspondences>& by_frame) {
   RecognizerResult best;
   for (const auto& [frame, correspondences] : by_frame) {
-    Recognizer& recognizer = recognizers_.try_emplace({robot, frame}, parameters_.recognizer).first->second;
-    RecognizerResult result = recognizer.Recognize(correspondences);
+    RecognizerResult result =
+        recognize_ ? recognize_(correspondences)
+                   : recognizers_.try_emplace({robot, frame}, parameters_.recognizer).first->second.Recognize(correspondences);
     const bool better = result.recognition.has_value() != best.recognition.has_value() ? result.recognition.has_value()
                                                                                        : result.clique_size > best.clique_size;
     if (better || frame == by_frame.begin()->first) best = std::move(result);
@@ -475,7 +478,7 @@ std::optional<Closure> BackEnd::MakeClosure(RobotIndex robot, StampNs stamp_ns, 
   closure.rms_m = recognition.rms_m;
   closure.T_map_odom = recognition.T_target_local;
   for (const Correspondence& c : recognition.inliers)
-    closure.matches.push_back({c.local, c.target, c.centroid_local, c.centroid_target});
+    closure.matches.push_back({c.local, c.target, c.centroid_local, c.centroid_target, c.descriptor_distance});
   return closure;
 }
 

@@ -59,7 +59,7 @@ class BatchBaseline::Impl {
     RequirePositive("batch.growing_radius_m", parameters.growing_radius_m);
     RequirePositive("batch.normal_radius_m", parameters.normal_radius_m);
     RequirePositive("batch.region_neighbours", parameters.region_neighbours);
-    RequirePositive("batch.max_normal_angle_rad", parameters.max_normal_angle_rad);
+    RequirePositive("batch.smoothness.max_angle_rad", parameters.smoothness.max_angle_rad);
     RequirePositive("batch.epsilon_m", parameters.epsilon_m);
     if (parameters.min_consistent < 3) throw std::invalid_argument("batch.min_consistent: must be at least 3");
   }
@@ -142,8 +142,12 @@ class BatchBaseline::Impl {
     growing.setNumberOfNeighbours(static_cast<unsigned>(parameters_.region_neighbours));
     growing.setInputCloud(cloud_);
     growing.setInputNormals(normals);
-    growing.setSmoothnessThreshold(static_cast<float>(parameters_.max_normal_angle_rad));
-    growing.setCurvatureThreshold(static_cast<float>(parameters_.max_seed_curvature));
+    const SmoothnessParameters& smoothness = parameters_.smoothness;
+    growing.setSmoothnessThreshold(static_cast<float>(smoothness.max_angle_rad));
+    growing.setCurvatureTestFlag(smoothness.measure == RoughnessMeasure::kCurvature);
+    growing.setCurvatureThreshold(static_cast<float>(smoothness.max_curvature));
+    growing.setResidualTestFlag(smoothness.measure == RoughnessMeasure::kPlaneResidual);
+    growing.setResidualThreshold(static_cast<float>(smoothness.max_residual_m));
     std::vector<pcl::PointIndices> found;
     growing.extract(found);
     return ToClusters(&found);
@@ -181,10 +185,10 @@ class BatchBaseline::Impl {
     return recognition;
   }
 
-  BatchSegment Describe(const std::vector<std::int32_t>& cluster) const {
+  BatchSegment Describe(std::vector<std::int32_t> cluster) const {
     SegmentMoments moments;
     for (const std::int32_t index : cluster) moments.Add((*cloud_)[index].getVector3fMap().cast<double>());
-    return {moments.count(), moments.Centroid(), describer_.Describe(moments, Eigen::Vector3d::UnitZ())};
+    return {std::move(cluster), moments.Centroid(), describer_.Describe(moments, Eigen::Vector3d::UnitZ())};
   }
 
   const BatchBaselineParameters& parameters() const { return parameters_; }
@@ -215,6 +219,8 @@ BatchBaseline::~BatchBaseline() = default;
 BatchBaseline::BatchBaseline(BatchBaseline&&) noexcept = default;
 BatchBaseline& BatchBaseline::operator=(BatchBaseline&&) noexcept = default;
 
+const BatchBaselineParameters& BatchBaseline::parameters() const { return impl_->parameters(); }
+
 BatchStep BatchBaseline::Process(const Points& obstacles_sensor, const Pose& T_odom_sensor) {
   BatchStep step;
   StageTimer timer;
@@ -223,7 +229,7 @@ BatchStep BatchBaseline::Process(const Points& obstacles_sensor, const Pose& T_o
   BuildTree();
   timer.Lap("tree");
   BatchClusters clusters;
-  if (impl_->parameters().segmentation == BatchSegmentation::kSmoothness) {
+  if (impl_->parameters().segmentation == Segmentation::kSmoothness) {
     EstimateNormals();
     timer.Lap("normals");
     clusters = GrowSmoothRegions();
@@ -232,7 +238,7 @@ BatchStep BatchBaseline::Process(const Points& obstacles_sensor, const Pose& T_o
   }
   timer.Lap("segmentation");
   step.segments.reserve(clusters.size());
-  for (const std::vector<std::int32_t>& cluster : clusters) step.segments.push_back(impl_->Describe(cluster));
+  for (std::vector<std::int32_t>& cluster : clusters) step.segments.push_back(impl_->Describe(std::move(cluster)));
   timer.Lap("description");
   step.voxels = size();
   step.times = timer.Take();

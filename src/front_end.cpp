@@ -5,13 +5,30 @@
 #include <utility>
 
 namespace incremental_segmatch {
+namespace {
+
+std::unique_ptr<IncrementalNormals> MakeNormals(const FrontEndParameters& parameters, const DynamicVoxelGrid& grid) {
+  if (parameters.segmentation != Segmentation::kSmoothness) return nullptr;
+  return std::make_unique<IncrementalNormals>(parameters.normals, grid);
+}
+
+std::unique_ptr<Segmenter> MakeSegmenter(const FrontEndParameters& parameters, const DynamicVoxelGrid& grid,
+                                         const IncrementalNormals* normals) {
+  if (parameters.segmentation != Segmentation::kSmoothness)
+    return std::make_unique<IncrementalSegmenter<EuclideanPolicy>>(parameters.segmenter, grid);
+  return std::make_unique<IncrementalSegmenter<SmoothnessPolicy>>(parameters.segmenter, grid,
+                                                                  SmoothnessPolicy(parameters.smoothness, *normals));
+}
+
+}  // namespace
 
 FrontEnd::FrontEnd(const FrontEndParameters& parameters, std::string robot)
     : parameters_(parameters),
       robot_(std::move(robot)),
       ground_filter_(parameters.ground),
       grid_(parameters.grid),
-      segmenter_(parameters.segmenter, grid_),
+      normals_(MakeNormals(parameters, grid_)),
+      segmenter_(MakeSegmenter(parameters, grid_, normals_.get())),
       describer_(parameters.descriptor, parameters.grid.resolution_m) {
   if (!(parameters.local_radius_m > 0.0)) throw std::invalid_argument("front_end.local_radius_m: must be positive");
   if (!(parameters.view.growth_factor > 1.0)) throw std::invalid_argument("front_end.view.growth_factor: must exceed 1");
@@ -32,17 +49,25 @@ FrontEndStep FrontEnd::Process(const Scan& scan) {
   FrontEndStep step;
   StageTimer timer;
 
-  const GroundFilterResult filtered = ground_filter_.Filter(scan.points_sensor, scan.T_odom_sensor);
+  GroundFilterResult filtered = ground_filter_.Filter(scan.points_sensor, scan.T_odom_sensor);
   timer.Lap("ground_filter");
 
   const VoxelUpdate left = grid_.RemoveOutside(scan.T_odom_sensor.translation(), parameters_.local_radius_m);
   timer.Lap("voxel_removal");
-  const SegmentUpdate left_segments = segmenter_.Remove(left.removed);
+  if (normals_) {
+    normals_->Remove(left.removed);
+    timer.Lap("normal_removal");
+  }
+  const SegmentUpdate left_segments = segmenter_->Remove(left.removed);
   timer.Lap("segment_removal");
 
   const VoxelUpdate inserted = grid_.Insert(filtered.obstacles_sensor, scan.T_odom_sensor);
   timer.Lap("voxel_insertion");
-  const SegmentUpdate grown_segments = segmenter_.Insert(inserted);
+  if (normals_) {
+    normals_->Insert(inserted);
+    timer.Lap("normals");
+  }
+  const SegmentUpdate grown_segments = segmenter_->Insert(inserted);
   timer.Lap("segmentation");
 
   step.delta = DescribeChanges(left_segments, grown_segments);
@@ -57,7 +82,8 @@ FrontEndStep FrontEnd::Process(const Scan& scan) {
   step.counts.activated_voxels = inserted.activated.size();
   step.counts.moved_voxels = inserted.moved.size();
   step.counts.removed_voxels = left.removed.size();
-  step.counts.clusters = segmenter_.counts();
+  step.counts.clusters = segmenter_->counts();
+  step.obstacles_sensor = std::move(filtered.obstacles_sensor);
   return step;
 }
 
@@ -79,7 +105,7 @@ SegmentDelta FrontEnd::DescribeChanges(const SegmentUpdate& left, const SegmentU
 
   std::vector<SegmentId> changed;
   if (jumped_) {
-    changed = segmenter_.Segments();
+    changed = segmenter_->Segments();
     jumped_ = false;
   } else {
     changed = grown.grown;
@@ -97,7 +123,7 @@ SegmentDelta FrontEnd::DescribeChanges(const SegmentUpdate& left, const SegmentU
 }
 
 SegmentState FrontEnd::DescribeSegment(SegmentId segment) const {
-  const SegmentMoments& moments = segmenter_.Moments(segment);
+  const SegmentMoments& moments = segmenter_->Moments(segment);
   SegmentState state;
   state.id = segment;
   state.size = static_cast<std::uint32_t>(moments.count());
@@ -117,7 +143,7 @@ bool FrontEnd::IsNewView(const SegmentState& state) {
 }
 
 std::shared_ptr<const Points> FrontEnd::SegmentPoints(SegmentId segment, const Eigen::Vector3d& centroid_odom) const {
-  const std::vector<VoxelHandle> voxels = segmenter_.Voxels(segment);
+  const std::vector<VoxelHandle> voxels = segmenter_->Voxels(segment);
   auto points = std::make_shared<Points>();
   points->reserve(voxels.size());
   for (const VoxelHandle voxel : voxels) points->push_back((grid_.CentroidOdom(voxel) - centroid_odom).cast<float>());
@@ -136,7 +162,7 @@ SegmentDelta FrontEnd::EmptyDelta() const {
 SegmentDelta FrontEnd::FullState() const {
   SegmentDelta delta = EmptyDelta();
   delta.full_state = true;
-  for (const SegmentId segment : segmenter_.Segments()) {
+  for (const SegmentId segment : segmenter_->Segments()) {
     SegmentState state = DescribeSegment(segment);
     state.new_view = true;
     state.points_centroid = SegmentPoints(segment, state.centroid_odom);
@@ -149,10 +175,12 @@ std::vector<LocalPoint> FrontEnd::LocalCloud() const {
   std::vector<LocalPoint> cloud;
   cloud.reserve(grid_.active_voxels());
   for (const VoxelHandle voxel : grid_.ActiveVoxels())
-    cloud.push_back({grid_.CentroidOdom(voxel).cast<float>(), segmenter_.SegmentOf(voxel)});
+    cloud.push_back({grid_.CentroidOdom(voxel).cast<float>(), segmenter_->SegmentOf(voxel)});
   return cloud;
 }
 
-std::size_t FrontEnd::memory_bytes() const { return grid_.memory_bytes() + segmenter_.memory_bytes(); }
+std::size_t FrontEnd::memory_bytes() const {
+  return grid_.memory_bytes() + segmenter_->memory_bytes() + (normals_ ? normals_->memory_bytes() : 0);
+}
 
 }  // namespace incremental_segmatch

@@ -38,6 +38,18 @@ const EnumNames<GroundModel>& NamesOf(GroundModel) {
   return names;
 }
 
+const EnumNames<Segmentation>& NamesOf(Segmentation) {
+  static const EnumNames<Segmentation> names{{Segmentation::kEuclidean, "euclidean"},
+                                             {Segmentation::kSmoothness, "smoothness"}};
+  return names;
+}
+
+const EnumNames<RoughnessMeasure>& NamesOf(RoughnessMeasure) {
+  static const EnumNames<RoughnessMeasure> names{{RoughnessMeasure::kCurvature, "curvature"},
+                                                 {RoughnessMeasure::kPlaneResidual, "plane_residual"}};
+  return names;
+}
+
 const EnumNames<BoundaryPolicy>& NamesOf(BoundaryPolicy) {
   static const EnumNames<BoundaryPolicy> names{{BoundaryPolicy::kInvalidate, "invalidate"},
                                                {BoundaryPolicy::kKeep, "keep"}};
@@ -253,6 +265,8 @@ Parameter Number(const char* key, Access access, const Interval& interval, const
 const std::vector<Parameter>& Table() {
   static const std::vector<Parameter> table{
       NUMBER(front_end.local_radius_m, Above(0), "radius of the local map around the sensor, horizontally"),
+      CHOICE(front_end.segmentation,
+             "how voxels are grouped: whatever hangs together, or smooth surfaces, for which normals are kept"),
 
       CHOICE(front_end.ground.model,
              "what goes as ground: nothing; what lies below a height in the sensor's frame; what lies less than a "
@@ -284,6 +298,18 @@ const std::vector<Parameter>& Table() {
              "what becomes of a segment that the boundary of the local map cuts: it is none any more, or it stays one "
              "until it has "
              "left entirely"),
+
+      NUMBER(front_end.normals.radius_m, Above(0), "`smoothness`: of a normal's neighbourhood; at most 8 voxels"),
+      NUMBER(front_end.normals.renewal_tolerance_voxels, AtLeast(0),
+             "`smoothness`: a voxel's contribution to normals is renewed once its centroid moved so far, in voxels"),
+
+      NUMBER(front_end.smoothness.max_angle_rad, Inside(0, 0.5 * kPi),
+             "`smoothness`: between the normals of neighbours in a segment"),
+      CHOICE(front_end.smoothness.measure,
+             "`smoothness`: what makes a voxel too rough to grow from: the thickness of its neighbourhood for its "
+             "width, or its distance from a plane"),
+      NUMBER(front_end.smoothness.max_curvature, Above(0), "`curvature`: rougher voxels do not seed"),
+      NUMBER(front_end.smoothness.max_residual_m, Above(0), "`plane_residual`: rougher voxels do not seed"),
 
       CHOICE(front_end.descriptor.eigenvalues, "the seven eigenvalue features: linearity, planarity, scattering, ..."),
       CHOICE(front_end.descriptor.sizes,
@@ -412,6 +438,8 @@ const std::vector<Relation>& Relations() {
        [](const Parameters& p) {
          return p.front_end.segmenter.growing_radius_m <= 16.0 * p.front_end.grid.resolution_m;
        }},
+      {"front_end.normals.radius_m", "must be at most 8 * grid.resolution_m",
+       [](const Parameters& p) { return p.front_end.normals.radius_m <= 8.0 * p.front_end.grid.resolution_m; }},
       {"front_end.segmenter.max_cluster_size", "must be at least min_cluster_size",
        [](const Parameters& p) {
          return p.front_end.segmenter.max_cluster_size >= p.front_end.segmenter.min_cluster_size;

@@ -161,13 +161,6 @@ std::size_t RunnerUpSize(const ConsistencyGraph& graph, const Vertices& winner, 
   return FindMaxClique(Without(graph, winner), parameters).vertices.size();
 }
 
-/// Standard deviation per axis of a centroid's error, from the residual of a fit that took six degrees of freedom.
-double CentroidSigma(double rms_m, std::size_t inliers, double min_sigma_m) {
-  const double count = static_cast<double>(inliers);
-  const double degrees_of_freedom = std::max(3.0 * count - 6.0, 1.0);
-  return std::max(min_sigma_m, rms_m * std::sqrt(count / degrees_of_freedom));
-}
-
 void Validate(const RecognizerParameters& parameters) {
   constexpr double kPi = 3.14159265358979323846;
   const auto require = [](bool good, const char* message) {
@@ -204,6 +197,12 @@ Covariance6 TransformCovariance(const std::vector<Eigen::Vector3d>& points_targe
   to_origin.topRightCorner<3, 3>() = CrossMatrix(centroid);
   const Covariance6 covariance = sigma_m * sigma_m * to_origin * about_centroid * to_origin.transpose();
   return 0.5 * (covariance + covariance.transpose());
+}
+
+double CentroidSigma(double rms_m, std::size_t inliers, double min_sigma_m) {
+  const double count = static_cast<double>(inliers);
+  const double degrees_of_freedom = std::max(3.0 * count - 6.0, 1.0);
+  return std::max(min_sigma_m, rms_m * std::sqrt(count / degrees_of_freedom));
 }
 
 Recognizer::Recognizer(const RecognizerParameters& parameters)

@@ -2,6 +2,7 @@
 /// Map side: changed segments of any number of robots to recognitions; owns the target map (METHOD 4 and 5).
 #pragma once
 
+#include <functional>
 #include <map>
 #include <optional>
 #include <string>
@@ -58,6 +59,7 @@ struct SegmentMatch {
   SegmentKey target;                                              ///< of the target map
   Eigen::Vector3d centroid_local_odom = Eigen::Vector3d::Zero();  ///< in the query robot's odometry frame
   Eigen::Vector3d centroid_target_map = Eigen::Vector3d::Zero();  ///< in the map
+  float descriptor_distance = 0.f;                                ///< scaled descriptor distance
 };
 
 /// Relative pose of two sensor poses: what every pose graph takes.
@@ -121,13 +123,16 @@ struct BackEndStep {
   StageTimes times;                      ///< of this step
 };
 
+/// Takes the place of Recognizer: the batch baseline's, say.
+using RecognizeFunction = std::function<RecognizerResult(const Correspondences&)>;
+
 /// Recognises places. Synchronous; not thread-safe.
 class BackEnd {
  public:
   /// Throws std::invalid_argument naming the parameter that is out of range, or in kLocalization.
-  explicit BackEnd(const BackEndParameters& parameters);
+  explicit BackEnd(const BackEndParameters& parameters, RecognizeFunction recognize = {});
   /// With a map that was loaded: needed for kLocalization, allowed for kLoopClosure.
-  BackEnd(const BackEndParameters& parameters, TargetMap map);
+  BackEnd(const BackEndParameters& parameters, TargetMap map, RecognizeFunction recognize = {});
 
   /// Applies a delta of a robot and attempts a recognition.
   BackEndStep Process(const SegmentDelta& delta);
@@ -194,6 +199,7 @@ class BackEnd {
   void JoinFrames(RobotIndex robot, RobotIndex target_robot, const Pose& T_map_odom);
 
   BackEndParameters parameters_;
+  RecognizeFunction recognize_;  // none: recognizers_
   TargetMap map_;
   TargetIndex index_;
   std::map<std::pair<RobotIndex, RobotIndex>, Recognizer> recognizers_;  // by robot and frame of its targets

@@ -13,30 +13,25 @@
 
 #include "incremental_segmatch/correspondence.hpp"
 #include "incremental_segmatch/descriptors.hpp"
+#include "incremental_segmatch/growing_policies.hpp"
 #include "incremental_segmatch/stage_times.hpp"
 #include "incremental_segmatch/types.hpp"
 
 namespace incremental_segmatch {
 
-/// How a batch step finds its segments.
-enum class BatchSegmentation {
-  kEuclidean,  ///< pcl::EuclideanClusterExtraction
-  kSmoothness  ///< pcl::NormalEstimation and pcl::RegionGrowing
-};
-
 /// Of all stages.
 struct BatchBaselineParameters {
-  BatchSegmentation segmentation = BatchSegmentation::kEuclidean;  ///< how voxels are grouped
-  double local_radius_m = 50.0;                                    ///< of the local map around the sensor, horizontally
-  double resolution_m = 0.1;                                       ///< side of a voxel
+  /// How voxels are grouped: pcl::EuclideanClusterExtraction, or pcl::NormalEstimation and pcl::RegionGrowing.
+  Segmentation segmentation = Segmentation::kEuclidean;
+  double local_radius_m = 50.0;          ///< of the local map around the sensor, horizontally
+  double resolution_m = 0.1;             ///< side of a voxel
   int min_points_per_voxel = 1;          ///< of the points and former centroids that fall into it
   double growing_radius_m = 0.2;         ///< of Euclidean clustering
   std::size_t min_cluster_size = 100;    ///< voxels; smaller clusters are no segments
   std::size_t max_cluster_size = 15000;  ///< voxels; larger clusters are no segments
   double normal_radius_m = 0.3;          ///< neighbourhood of a normal
   int region_neighbours = 30;            ///< pcl::RegionGrowing grows to this many nearest neighbours
-  double max_normal_angle_rad = 0.07;    ///< between the normals of neighbours in a region
-  double max_seed_curvature = 0.05;      ///< points of larger curvature do not grow regions
+  SmoothnessParameters smoothness;       ///< which neighbours belong to a region
   double epsilon_m = 0.4;                ///< by how much distances in a consistent set may differ
   std::size_t min_consistent = 6;        ///< size of the smallest consistent set that is a recognition
   DescriptorParameters descriptor;       ///< features of a segment
@@ -58,7 +53,7 @@ struct BatchRecognition {
 
 /// A described segment of a batch step; it has no identity from step to step.
 struct BatchSegment {
-  std::size_t size = 0;                                     ///< voxels
+  std::vector<std::int32_t> cluster;                        ///< its points, as indices into the local cloud
   Eigen::Vector3d centroid_odom = Eigen::Vector3d::Zero();  ///< mean of its voxels' centroids (m)
   Descriptor descriptor;                                    ///< unscaled
 };
@@ -83,6 +78,9 @@ class BatchBaseline {
   BatchBaseline(BatchBaseline&&) noexcept;
   /// Moves likewise.
   BatchBaseline& operator=(BatchBaseline&&) noexcept;
+
+  /// As given to the constructor.
+  const BatchBaselineParameters& parameters() const;
 
   /// A whole step on obstacle points (finite, without ground): all stages below up to segmentation, and a description
   /// of every segment.

@@ -2,6 +2,7 @@
 /// Robot side: scan and pose to changed, described segments (METHOD 0 to 4).
 #pragma once
 
+#include <memory>
 #include <string>
 #include <unordered_map>
 #include <vector>
@@ -9,6 +10,7 @@
 #include "incremental_segmatch/descriptors.hpp"
 #include "incremental_segmatch/dynamic_voxel_grid.hpp"
 #include "incremental_segmatch/ground_filter.hpp"
+#include "incremental_segmatch/incremental_normals.hpp"
 #include "incremental_segmatch/incremental_segmenter.hpp"
 #include "incremental_segmatch/segment_delta.hpp"
 #include "incremental_segmatch/stage_times.hpp"
@@ -27,7 +29,10 @@ struct FrontEndParameters {
   GroundFilterParameters ground;    ///< which points are obstacles
   double local_radius_m = 50.0;     ///< of the local map around the sensor, horizontally
   DynamicVoxelGridParameters grid;  ///< of the local map
+  Segmentation segmentation = Segmentation::kEuclidean;  ///< the growing policy
   SegmenterParameters segmenter;    ///< voxels to segments
+  NormalsParameters normals;        ///< kSmoothness: of the voxels
+  SmoothnessParameters smoothness;  ///< kSmoothness: which neighbours belong together
   DescriptorParameters descriptor;  ///< features of a segment
   ViewParameters view;              ///< when a view is kept
 };
@@ -50,6 +55,7 @@ struct FrontEndStep {
   SegmentDelta delta;     ///< what changed
   FrontEndCounts counts;  ///< the funnel
   StageTimes times;       ///< of this step
+  Points obstacles_sensor;  ///< of the scan, what passed the ground filter; in the sensor's frame (m)
 };
 
 /// A point of the local map with the segment it belongs to (kNoSegment if none): for people to look at.
@@ -95,7 +101,6 @@ class FrontEnd {
     Eigen::Vector3d view_position_odom = Eigen::Vector3d::Zero();
   };
 
-  VoxelUpdate RemoveDistantVoxels(const Pose& T_odom_sensor);
   SegmentDelta DescribeChanges(const SegmentUpdate& left, const SegmentUpdate& grown);
   SegmentState DescribeSegment(SegmentId segment) const;
   bool IsNewView(const SegmentState& state);
@@ -106,7 +111,8 @@ class FrontEnd {
   std::string robot_;
   GroundFilter ground_filter_;
   DynamicVoxelGrid grid_;
-  IncrementalSegmenter<EuclideanPolicy> segmenter_;
+  std::unique_ptr<IncrementalNormals> normals_;  // only where the growing policy reads them
+  std::unique_ptr<Segmenter> segmenter_;
   Describer describer_;
   std::unordered_map<SegmentId, Tracked> tracked_;
   std::uint64_t sequence_ = 0;

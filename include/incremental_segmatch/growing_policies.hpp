@@ -11,6 +11,12 @@
 
 namespace incremental_segmatch {
 
+/// How voxels are grouped into segments.
+enum class Segmentation {
+  kEuclidean,  ///< whatever hangs together
+  kSmoothness  ///< smooth surfaces; needs normals, which are kept for it alone
+};
+
 /// Euclidean clustering: every neighbour within the growing radius belongs to the region.
 struct EuclideanPolicy {
   /// Every point may seed and be grown to: the segmenter may then settle whole blocks of voxels at once.

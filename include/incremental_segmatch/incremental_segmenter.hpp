@@ -65,7 +65,34 @@ struct ClusterCounts {
   std::size_t cut = 0;        ///< of them, cut by the boundary
 };
 
-/// Clusters the active voxels of a grid as they come and keeps track of segments.
+/// Clusters the active voxels of a grid as they come and keeps track of segments: what IncrementalSegmenter is to those
+/// who choose its policy at run time. One call of it is one call for a whole step; the policy is called inside of it.
+class Segmenter {
+ public:
+  virtual ~Segmenter() = default;
+
+  /// Takes removed voxels out. To be called before the grid is called again.
+  virtual SegmentUpdate Remove(const std::vector<RemovedVoxel>& removed) = 0;
+
+  /// Clusters activated voxels and follows moved centroids.
+  virtual SegmentUpdate Insert(const VoxelUpdate& update) = 0;
+
+  /// Sums over a segment's voxels. O(1).
+  virtual const SegmentMoments& Moments(SegmentId segment) const = 0;
+  /// Voxels of the segment that are in the local map now. O(segment).
+  virtual std::vector<VoxelHandle> Voxels(SegmentId segment) const = 0;
+  /// The segment of a voxel, kNoSegment if its cluster is none. Amortised nearly O(1).
+  virtual SegmentId SegmentOf(VoxelHandle voxel) const = 0;
+  /// All tracked segments, ascending.
+  virtual std::vector<SegmentId> Segments() const = 0;
+
+  /// Counts of clusters. O(1).
+  virtual const ClusterCounts& counts() const = 0;
+  /// Memory held, about. O(1).
+  virtual std::size_t memory_bytes() const = 0;
+};
+
+/// The segmenter of a growing policy.
 ///
 /// Clusters are the connected components over all voxels ever clustered, under the relation "within the growing radius,
 /// and accepted by the policy, when the later of the two was clustered"; a cluster never splits. Where the policy lets
@@ -74,32 +101,22 @@ struct ClusterCounts {
 /// reclaimed. Remove is O(removed), Insert O(activated * neighbours + moved), both nearly. Not thread-safe. The grid
 /// must outlive the segmenter.
 template <class Policy>
-class IncrementalSegmenter {
+class IncrementalSegmenter final : public Segmenter {
  public:
   /// Throws std::invalid_argument naming the parameter that is out of range.
   IncrementalSegmenter(const SegmenterParameters& parameters, const DynamicVoxelGrid& grid, Policy policy = {});
 
-  /// Takes removed voxels out. To be called before the grid is called again.
-  SegmentUpdate Remove(const std::vector<RemovedVoxel>& removed);
+  SegmentUpdate Remove(const std::vector<RemovedVoxel>& removed) override;
+  SegmentUpdate Insert(const VoxelUpdate& update) override;
+  const SegmentMoments& Moments(SegmentId segment) const override;
+  std::vector<VoxelHandle> Voxels(SegmentId segment) const override;
+  SegmentId SegmentOf(VoxelHandle voxel) const override;
+  std::vector<SegmentId> Segments() const override;
+  const ClusterCounts& counts() const override { return counts_; }
+  std::size_t memory_bytes() const override;
 
-  /// Clusters activated voxels and follows moved centroids.
-  SegmentUpdate Insert(const VoxelUpdate& update);
-
-  /// Sums over a segment's voxels. O(1).
-  const SegmentMoments& Moments(SegmentId segment) const;
-  /// Voxels of the segment that are in the local map now. O(segment).
-  std::vector<VoxelHandle> Voxels(SegmentId segment) const;
-  /// The segment of a voxel, kNoSegment if its cluster is none. Amortised nearly O(1).
-  SegmentId SegmentOf(VoxelHandle voxel) const;
   /// A name of the voxel's cluster that is the same for exactly the voxels of one cluster, until the next call.
   std::uint32_t ClusterOf(VoxelHandle voxel) const;
-  /// All tracked segments, ascending.
-  std::vector<SegmentId> Segments() const;
-
-  /// Counts of clusters. O(1).
-  const ClusterCounts& counts() const { return counts_; }
-  /// Memory held, about. O(1).
-  std::size_t memory_bytes() const;
 
  private:
   using Label = std::uint32_t;

@@ -63,6 +63,10 @@ struct RecognizerResult {
 /// times the lever arm. The points must not be collinear.
 Covariance6 TransformCovariance(const std::vector<Eigen::Vector3d>& points_target, double sigma_m);
 
+/// Standard deviation per axis of a centroid's error, from the residual of a rigid fit, which took six degrees of freedom;
+/// at least min_sigma_m.
+double CentroidSigma(double rms_m, std::size_t inliers, double min_sigma_m);
+
 /// Maximum geometrically consistent set of the correspondences and its rigid transform. No prior on the pose enters.
 /// The result does not depend on the order of the correspondences, which are sorted by their keys first; of several
 /// maximum sets the one with the smaller residual (to the micrometre) wins, then the smallest list of keys.

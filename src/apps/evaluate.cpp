@@ -3,6 +3,7 @@
 #include <cmath>
 #include <cstdio>
 #include <filesystem>
+#include <map>
 #include <memory>
 #include <random>
 #include <string>
@@ -179,6 +180,14 @@ void AddEvaluateCommand(CLI::App& app) {
   map_kitti->needs(map_sequence);
   command->add_option("--save-map", parameters.save_map,
                       "save the map in the end, and the truth of this drive, if it is known, beside it");
+  const std::map<std::string, Pipeline> pipelines{
+      {"incremental", Pipeline::kIncremental}, {"batch", Pipeline::kBatch}, {"both", Pipeline::kBoth}};
+  command
+      ->add_option("--pipeline", parameters.pipeline,
+                   "incremental, batch (the original SegMatch on PCL), or both: steps.csv has the times of the batch\n"
+                   "stages, run on each step's own input, beside ours")
+      ->transform(CLI::CheckedTransformer(pipelines, CLI::ignore_case))
+      ->default_str("incremental");
   command->add_option("--max-steps", parameters.max_steps, "stop after this many scans")->check(CLI::PositiveNumber);
   command
       ->add_option("--closure-spacing", parameters.closure_spacing_m,

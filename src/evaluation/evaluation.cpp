@@ -2,9 +2,11 @@
 
 #include <algorithm>
 #include <chrono>
+#include <memory>
 #include <stdexcept>
 
 #include "incremental_segmatch/back_end.hpp"
+#include "incremental_segmatch/batch_pipeline.hpp"
 #include "incremental_segmatch/front_end.hpp"
 #include "incremental_segmatch/pose_graph_io.hpp"
 
@@ -23,12 +25,19 @@ class Stopwatch {
   std::chrono::steady_clock::time_point start_ = std::chrono::steady_clock::now();
 };
 
+// With Pipeline::kBatch, the original's recognition takes the place of ours.
+RecognizeFunction MakeRecognition(const EvaluationParameters& parameters) {
+  if (parameters.pipeline != Pipeline::kBatch) return {};
+  const auto batch = std::make_shared<BatchRecognizer>(parameters.core.front_end, parameters.core.back_end.recognizer);
+  return [batch](const Correspondences& correspondences) { return batch->Recognize(correspondences); };
+}
+
 BackEnd MakeBackEnd(const EvaluationParameters& parameters) {
   const BackEndParameters& core = parameters.core.back_end;
-  if (core.mode == Mode::kLoopClosure && parameters.map_file.empty()) return BackEnd(core);
+  if (core.mode == Mode::kLoopClosure && parameters.map_file.empty()) return BackEnd(core, MakeRecognition(parameters));
   if (core.mode == Mode::kLoopClosure || parameters.map_file.empty())
     throw std::invalid_argument("localization and a map to localize in need each other");
-  return BackEnd(core, TargetMap::Load(parameters.map_file, core.target_map));
+  return BackEnd(core, TargetMap::Load(parameters.map_file, core.target_map), MakeRecognition(parameters));
 }
 
 ClosureRow ToRow(const Closure& closure) {
@@ -165,9 +174,14 @@ EvaluationResult Evaluate(DriveSource& drive, const EvaluationParameters& parame
                           const std::function<void(std::size_t, std::size_t)>& progress) {
   const Stopwatch run;
   const std::size_t steps = std::min(drive.size(), parameters.max_steps);
-  FrontEnd front_end(parameters.core.front_end, parameters.robot);
+  const FrontEndParameters& front_end_parameters = parameters.core.front_end;
+  const RecognizerParameters& recognizer_parameters = parameters.core.back_end.recognizer;
+  const bool is_batch = parameters.pipeline == Pipeline::kBatch;
+  FrontEnd front_end(front_end_parameters, parameters.robot);
+  BatchFrontEnd batch_front_end(front_end_parameters, recognizer_parameters, parameters.robot);
   BackEnd back_end = MakeBackEnd(parameters);
   const bool optimize = parameters.optimize && parameters.map_file.empty();
+  BatchComparison comparison(BatchParametersOf(front_end_parameters, recognizer_parameters));
   LoopCloser closer(parameters);
   EvaluationResult result;
   result.drive = drive.name();
@@ -182,11 +196,13 @@ EvaluationResult Evaluate(DriveSource& drive, const EvaluationParameters& parame
     record.read_ms = reading.Milliseconds();
     record.stamp_ns = scan.stamp_ns;
 
-    const Stopwatch step;
-    FrontEndStep seen = front_end.Process(scan);
+    const double step_start_ms = ThreadCpuMs();
+    FrontEndStep seen = is_batch ? batch_front_end.Process(scan) : front_end.Process(scan);
     BackEndStep recognized = back_end.Process(seen.delta);
-    record.total_ms = step.Milliseconds();
+    record.total_ms = ThreadCpuMs() - step_start_ms;
 
+    if (parameters.pipeline == Pipeline::kBoth)
+      record.batch = comparison.Run(seen, recognized, scan.T_odom_sensor);
     record.stages = std::move(seen.times);
     record.stages.insert(record.stages.end(), recognized.times.begin(), recognized.times.end());
     record.front_end = seen.counts;

@@ -8,6 +8,7 @@
 #include <string>
 #include <vector>
 
+#include "evaluation/batch_comparison.hpp"
 #include "evaluation/drive_source.hpp"
 #include "evaluation/scoring.hpp"
 #include "evaluation/trajectory_error.hpp"
@@ -16,9 +17,17 @@
 
 namespace incremental_segmatch {
 
+/// What a drive is run through.
+enum class Pipeline {
+  kIncremental,
+  kBatch,  ///< the original SegMatch on PCL in its place
+  kBoth    ///< incremental, and every step's batch stages on the same input beside it, for their times
+};
+
 /// What is run, and how it is judged.
 struct EvaluationParameters {
   Parameters core;
+  Pipeline pipeline = Pipeline::kIncremental;
   PoseGraphParameters pose_graph;
   ScoringParameters scoring;
   bool optimize = true;                  ///< false: recognitions only, nothing is corrected
@@ -37,13 +46,14 @@ std::string MapTruthPath(const std::string& map_file);
 /// A row of steps.csv.
 struct StepRecord {
   StampNs stamp_ns = 0;
-  double total_ms = 0.0;     ///< front end and back end; neither reading nor optimizing
+  double total_ms = 0.0;     ///< front end and back end, CPU time; neither reading nor optimizing
   double read_ms = 0.0;      ///< getting the scan
   double optimize_ms = 0.0;  ///< pose graph and correction of the target map, 0 if it was not this step's turn
   StageTimes stages;
   std::size_t described = 0;  ///< segments that changed in this step, and so were described anew
   FrontEndCounts front_end;
   BackEndCounts back_end;
+  std::optional<BatchRecord> batch;  ///< with Pipeline::kBoth
 };
 
 /// A recognition that came as far as to be judged by its evidence, accepted or not.

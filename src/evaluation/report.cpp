@@ -66,7 +66,10 @@ void WriteStepsCsv(const EvaluationResult& result, const std::string& path) {
   const std::vector<EvidenceColumn> evidence = EvidenceColumns();
   for (const FunnelColumn& column : counts) file << ',' << column.name;
   for (const EvidenceColumn& column : evidence) file << ',' << column.name;
-  file << ",end,revisit,verdict\n";
+  file << ",end,revisit,verdict";
+  const bool has_batch = !steps.empty() && steps.front().batch.has_value();
+  if (has_batch) WriteBatchHeader(*steps.front().batch, file);
+  file << '\n';
   for (std::size_t i = 0; i < steps.size(); ++i) {
     const StepRecord& step = steps[i];
     file << i << ',' << FormatSeconds(step.stamp_ns) << ',' << step.total_ms;
@@ -78,7 +81,9 @@ void WriteStepsCsv(const EvaluationResult& result, const std::string& path) {
       if (step.back_end.evidence) file << column.value(*step.back_end.evidence);
     }
     file << ',' << ToString(step.back_end.end);
-    file << ',' << RevisitOf(result, i) << ',' << verdicts[i] << '\n';
+    file << ',' << RevisitOf(result, i) << ',' << verdicts[i];
+    if (has_batch) WriteBatchColumns(*step.batch, file);
+    file << '\n';
   }
   file.close();
   if (!file) throw std::runtime_error("writing " + path + " failed: is the disk full?");
@@ -215,6 +220,13 @@ std::string SummaryJson(const EvaluationResult& result) {
         {"mean", Mean(values)}, {"median", Percentile(values, 0.5)}, {"max", Percentile(values, 1.0)}};
   }
   json["steps_ended_by"] = CountEnds(result.steps);
+  for (const StageComparison& stage : CompareStages(result.steps)) {
+    json["batch_comparison"].push_back({{"stage", stage.stage},
+                                        {"steps", stage.steps},
+                                        {"incremental_median_ms", stage.incremental_ms},
+                                        {"batch_median_ms", stage.batch_ms},
+                                        {"ratio", stage.ratio()}});
+  }
   return json.dump(2) + "\n";
 }
 
@@ -242,6 +254,13 @@ std::string FormatSummary(const EvaluationResult& result) {
     text += Format("%-20s %9s %9s %9s %9s\n", stage.name.c_str(), Number(stage.median_ms, "%.3f").c_str(),
                    Number(stage.p95_ms, "%.3f").c_str(), Number(stage.p99_ms, "%.3f").c_str(),
                    Number(stage.max_ms, "%.3f").c_str());
+  }
+  const std::vector<StageComparison> comparison = CompareStages(result.steps);
+  if (!comparison.empty())
+    text += Format("\n%-34s %9s %9s %9s %9s\n", "medians, ms", "steps", "ours", "batch", "ratio");
+  for (const StageComparison& stage : comparison) {
+    text += Format("%-34s %9zu %9.3f %9.3f %9s\n", stage.stage.c_str(), stage.steps, stage.incremental_ms, stage.batch_ms,
+                   Number(stage.ratio(), "%.1f").c_str());
   }
   return text;
 }

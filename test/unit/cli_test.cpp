@@ -228,5 +228,31 @@ TEST_F(Drive, MatrixGathersRuns) {
   EXPECT_HAS(unknown.output, "nowhere");
 }
 
+TEST_F(Drive, BatchBesideIncremental) {
+  const std::string drive = "evaluate --simulate --sensor VLP-16 --route lap --first-frame 20 --max-steps 4 ";
+  const Outcome run = Segmatch(drive + "--pipeline both --out " + Out("both"));
+  ASSERT_EQ(run.status, 0) << run.output;
+  EXPECT_HAS(run.output, "segmentation, tree included");
+  const std::vector<std::string> steps = Lines(Out("both/steps.csv"));
+  ASSERT_EQ(steps.size(), 5u);
+  for (const std::string column : {"total_ms", "batch_total_ms", "batch_voxel_grid_ms", "batch_tree_ms", "batch_segmentation_ms",
+                                   "batch_recognition_ms", "batch_segments"})
+    EXPECT_HAS("," + steps[0] + ",", "," + column + ",");
+  for (const std::string& row : steps)
+    EXPECT_EQ(std::count(row.begin(), row.end(), ','), std::count(steps[0].begin(), steps[0].end(), ','));
+  std::ifstream file(Out("both/summary.json"));
+  const nlohmann::json comparison = nlohmann::json::parse(file)["batch_comparison"];
+  EXPECT_EQ(comparison.back()["stage"], "whole step");
+  EXPECT_EQ(comparison.back()["steps"], 4);
+  EXPECT_GT(comparison.back()["batch_median_ms"], 0.0);
+
+  const std::string config = directory_.Write("smooth.yaml", "front_end:\n  segmentation: smoothness\n");
+  EXPECT_HAS(Segmatch(drive + "--pipeline both --config " + config + " --out " + Out("smooth")).output, "normals, tree shared");
+  const Outcome batch = Segmatch(drive + "--pipeline batch --out " + Out("batch"));
+  ASSERT_EQ(batch.status, 0) << batch.output;
+  EXPECT_HAS(batch.output, "segment_clouds");
+  EXPECT_NE(Segmatch(drive + "--pipeline none --out " + Out("none")).status, 0);
+}
+
 }  // namespace
 }  // namespace incremental_segmatch

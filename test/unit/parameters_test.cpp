@@ -215,7 +215,7 @@ std::string RandomYaml(std::mt19937& random) {
 
 TEST(Parameters, YamlRoundTripsBitForBit) {
   int accepted = 0;
-  for (unsigned seed = 0; seed < 200; ++seed) {
+  for (unsigned seed = 0; seed < 400; ++seed) {
     SCOPED_TRACE("seed " + std::to_string(seed));
     std::mt19937 random(seed);
     Parameters p;
@@ -236,7 +236,7 @@ TEST(Parameters, YamlRoundTripsBitForBit) {
 // The parser refuses all that the classes refuse, so that a file that was read never fails later.
 TEST(Parameters, TheClassesAcceptWhatPasses) {
   int accepted = 0;
-  for (unsigned seed = 0; seed < 300; ++seed) {
+  for (unsigned seed = 0; seed < 400; ++seed) {
     SCOPED_TRACE("seed " + std::to_string(seed));
     std::mt19937 random(seed);
     Parameters p;
