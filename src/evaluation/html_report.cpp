@@ -27,14 +27,14 @@ p.note, li, figcaption { color: var(--soft); font-size: .9rem; }
 .tile { background: var(--panel); border-radius: .4rem; padding: .55rem .7rem; }
 .tile b { display: block; font-size: 1.2rem; font-weight: 600; }
 .tile span { color: var(--soft); font-size: .82rem; }
-.tile.good b { color: var(--true); } .tile.bad b { color: var(--false); }
-figure { margin: .5rem 0; } svg { width: 100%; height: auto; display: block; }
+.tile b span { color: inherit; font-size: inherit; } .tile.good b { color: var(--true); } .tile.bad b { color: var(--false); }
+figure { margin: .5rem 0; } figure.plot { max-width: 42rem; } svg { width: 100%; height: auto; display: block; }
 .table { overflow-x: auto; } table { border-collapse: collapse; font-size: .88rem; width: 100%; }
 th, td { padding: .25rem .6rem; border-bottom: 1px solid var(--rule); text-align: right; vertical-align: top;
   font-variant-numeric: tabular-nums; }
 th:first-child, td:first-child { text-align: left; } th { color: var(--soft); font-weight: 500; }
 svg text { fill: var(--soft); font: 12px system-ui, sans-serif; }
-svg text.number { fill: var(--ink); font-weight: 600; }
+svg text.number { fill: var(--ink); font-weight: 600; font-size: 14px; }
 .grid { stroke: var(--rule); stroke-width: 1; } .axis { stroke: var(--soft); stroke-width: 1; }
 .mark { stroke: var(--soft); stroke-width: 1; stroke-dasharray: 3 3; }
 polyline { fill: none; stroke-linejoin: round; } .curve { stroke-width: 2; }
@@ -62,9 +62,9 @@ std::string Heading(const std::string& text) {
   return "<h2>" + EscapeHtml(text) + "</h2>\n";
 }
 
-std::string Figure(const std::string& svg, const std::string& caption_html) {
-  return "<figure>" + svg + (caption_html.empty() ? "" : "<figcaption>" + caption_html + "</figcaption>") +
-         "</figure>\n";
+std::string Figure(const std::string& svg, const std::string& caption_html, const char* style_class = "plot") {
+  return std::string("<figure class=\"") + style_class + "\">" + svg +
+         (caption_html.empty() ? "" : "<figcaption>" + caption_html + "</figcaption>") + "</figure>\n";
 }
 
 std::string Count(std::size_t count) {
@@ -209,7 +209,7 @@ void DrawScale(const Projection& project, Svg* svg) {
 }
 
 std::string Map(const EvaluationResult& result, const std::vector<Stretch>& stretches) {
-  constexpr double kWidth = 960.0;
+  constexpr double kWidth = 640.0;
   const bool has_truth = result.truth.has_value();
   const std::vector<Pose> odometry = PosesOf(result.odometry), optimized = PosesOf(result.optimized);
   const std::vector<Pose>& reference = has_truth ? result.truth->T_world_sensor : optimized;
@@ -234,20 +234,20 @@ std::string Map(const EvaluationResult& result, const std::vector<Stretch>& stre
   if (!result.score) {
     for (const JudgedRecognition& recognition : result.recognitions) {
       if (recognition.end == StepEnd::kRecognized)
-        svg.Circle(at(recognition.step).x(), at(recognition.step).y(), 2.5, "unjudged", tip(recognition.step));
+        svg.Circle(at(recognition.step).x(), at(recognition.step).y(), 2, "unjudged", tip(recognition.step));
     }
   } else {
     for (const MissedRevisit& miss : FindMissedRevisits(result))
-      svg.Circle(at(miss.step).x(), at(miss.step).y(), 2.5, "lost", tip(miss.step) + ": " + miss.cause);
+      svg.Circle(at(miss.step).x(), at(miss.step).y(), 2, "lost", tip(miss.step) + ": " + miss.cause);
     for (const JudgedClosure& judged : result.score->judged) {
       if (judged.verdict == ClosureVerdict::kTrue)
-        svg.Circle(at(judged.query_step).x(), at(judged.query_step).y(), 2.5, "found", tip(judged.query_step));
+        svg.Circle(at(judged.query_step).x(), at(judged.query_step).y(), 2, "found", tip(judged.query_step));
     }
     for (const JudgedClosure& judged : result.score->judged) {
       if (judged.verdict != ClosureVerdict::kFalse) continue;
       const Eigen::Vector2d from = at(judged.query_step), to = project(targets[judged.target_step]);
       svg.Line(from.x(), from.y(), to.x(), to.y(), "wrong");
-      svg.Circle(from.x(), from.y(), 6, "wrong",
+      svg.Circle(from.x(), from.y(), 5, "wrong",
                  tip(judged.query_step) + ": off by " + FormatNumber(judged.translation_error_m, "%.2f m") + ", " +
                      FormatNumber(judged.rotation_error_deg, "%.1f°"));
     }
@@ -269,7 +269,7 @@ std::string Map(const EvaluationResult& result, const std::vector<Stretch>& stre
   }
   if (result.pose_graph && has_truth)
     caption += "<br/>blue line: optimized path; dashed: odometry, both aligned with the truth";
-  return Figure(svg.Finish(), caption);
+  return Figure(svg.Finish(), caption, "map");
 }
 
 std::string Gaps(const Score& score) {

@@ -99,7 +99,7 @@ void Svg::Text(double x, double y, const std::string& text, const std::string& a
 }
 
 std::string Draw(const Plot& plot) {
-  constexpr double kWidth = 640, kHeight = 300, kLeft = 52, kRight = 96, kTop = 26, kBottom = 44;
+  constexpr double kWidth = 460, kHeight = 270, kLeft = 40, kRight = 66, kTop = 26, kBottom = 44;
   const double x_max = plot.x_max > 0.0 ? plot.x_max : 1.0, y_max = plot.y_max > 0.0 ? plot.y_max : 1.0;
   const auto x_of = [&](double x) { return kLeft + (kWidth - kLeft - kRight) * std::min(x, x_max) / x_max; };
   const auto y_of = [&](double y) {
@@ -117,7 +117,7 @@ std::string Draw(const Plot& plot) {
   }
   svg.Line(kLeft, kHeight - kBottom, kWidth - kRight, kHeight - kBottom, "axis");
   svg.Text(0.5 * (kLeft + kWidth - kRight), kHeight - 8, plot.x_label, "middle");
-  svg.Text(kLeft - 40, 12, plot.y_label, "start");
+  svg.Text(kLeft - 34, 12, plot.y_label, "start");
   double word_end = 0.0;
   int level = 0;
   for (const auto& [x, word] : plot.x_marks) {
@@ -142,7 +142,7 @@ std::string Draw(const Plot& plot) {
 }
 
 std::string DrawBars(const std::vector<BarRow>& rows, const std::string& title) {
-  constexpr double kWidth = 640, kRow = 24, kLeft = 170, kWords = 170;
+  constexpr double kWidth = 460, kRow = 22, kLeft = 136, kWords = 130;
   double longest = 0.0;
   for (const BarRow& row : rows) longest = std::max({longest, row.value, row.extent});
   if (!(longest > 0.0)) longest = 1.0;
@@ -150,10 +150,10 @@ std::string DrawBars(const std::vector<BarRow>& rows, const std::string& title) 
   const double scale = (kWidth - kLeft - kWords) / longest;
   for (std::size_t i = 0; i < rows.size(); ++i) {
     const double y = 3 + kRow * static_cast<double>(i);
-    svg.Text(kLeft - 8, y + 16, rows[i].name, "end");
+    svg.Text(kLeft - 8, y + 15, rows[i].name, "end");
     if (rows[i].extent > rows[i].value) svg.Rectangle(kLeft, y + 4, scale * rows[i].extent, kRow - 8, "bar-extent");
     if (rows[i].value > 0.0) svg.Rectangle(kLeft, y + 4, scale * rows[i].value, kRow - 8, "bar");
-    svg.Text(kLeft + scale * std::max({0.0, rows[i].value, rows[i].extent}) + 6, y + 16, rows[i].words);
+    svg.Text(kLeft + scale * std::max({0.0, rows[i].value, rows[i].extent}) + 6, y + 15, rows[i].words);
   }
   return svg.Finish();
 }

@@ -27,6 +27,7 @@ Caster::Caster(const SensorModel& sensor) : sensor_(sensor) {
   for (int i = 0; i < sensor.columns; ++i) {
     cos_azimuth_.push_back(static_cast<float>(std::cos(kTwoPi * i / sensor.columns)));
     sin_azimuth_.push_back(static_cast<float>(std::sin(kTwoPi * i / sensor.columns)));
+    in_view_.push_back(std::abs(std::remainder(kTwoPi * i / sensor.columns, kTwoPi)) <= sensor.half_view_rad);
   }
 }
 
@@ -179,11 +180,16 @@ const Sweep& Caster::Cast(const Eigen::Isometry3d& T_world_sensor, const std::ve
   sweep_.range_m.assign(beams, static_cast<float>(sensor_.max_range_m));
   sweep_.cos_incidence.assign(beams, 1.f);
   sweep_.material.assign(beams, Material::kRoad);
+  // A beam of range 0 is hit by nothing.
+  for (std::size_t beam = 0; beam < beams; ++beam) {
+    if (!in_view_[beam % in_view_.size()]) sweep_.range_m[beam] = 0.f;
+  }
   Collect(T_world_sensor, items);
   for (const Candidate& candidate : candidates_) Draw(candidate);
   DrawGround(T_world_sensor, terrain);
-  for (float& range : sweep_.range_m) {
-    if (!(range < static_cast<float>(sensor_.max_range_m))) range = kInfinity;
+  for (std::size_t beam = 0; beam < beams; ++beam) {
+    float& range = sweep_.range_m[beam];
+    if (!(range < static_cast<float>(sensor_.max_range_m)) || !in_view_[beam % in_view_.size()]) range = kInfinity;
   }
   return sweep_;
 }

@@ -52,6 +52,7 @@ class Caster {
   void DrawGround(const Eigen::Isometry3d& T_world_sensor, const Terrain& terrain);
 
   SensorModel sensor_;
+  std::vector<bool> in_view_;  // by column
   std::vector<float> cos_elevation_, sin_elevation_, tan_elevation_, cos_azimuth_, sin_azimuth_;
   std::vector<Candidate> candidates_;
   Sweep sweep_;

@@ -87,11 +87,11 @@ void WriteKitti(Simulation& simulation, const std::string& root, const std::stri
   OutputFile times(folder / "times.txt"), odometry(folder / "odometry.txt"),
       poses(fs::path(root) / "poses" / (sequence + ".txt"));
   const Pose Tr = KittiCalibration();
-  const Pose T_first_world = simulation.T_world_sensor(0).inverse();
+  const Pose T_start_world = simulation.T_world_start().inverse();
   for (std::size_t i = 0; i < simulation.size(); ++i) {
     times.stream() << std::fixed << std::setprecision(9) << 1e-9 * static_cast<double>(simulation.stamp_ns(i)) << "\n";
     odometry.stream() << Row(simulation.T_odom_sensor(i)) << "\n";
-    poses.stream() << Row(Tr * T_first_world * simulation.T_world_sensor(i) * Tr.inverse()) << "\n";
+    poses.stream() << Row(Tr * T_start_world * simulation.T_world_sensor(i) * Tr.inverse()) << "\n";
   }
   times.Close();
   odometry.Close();

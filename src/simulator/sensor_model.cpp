@@ -17,7 +17,7 @@ void AppendBeams(std::vector<double>& elevations_rad, int count, double top_deg,
 }  // namespace
 
 std::vector<std::string> SensorNames() {
-  return {"HDL-64E", "HDL-32E", "VLP-16", "OS1-128"};
+  return {"HDL-64E", "HDL-32E", "VLP-16", "OS1-128", "Livox-Avia"};
 }
 
 SensorModel SensorByName(const std::string& name) {
@@ -41,8 +41,14 @@ SensorModel SensorByName(const std::string& name) {
     AppendBeams(model.elevations_rad, 128, 22.5, -22.5);
     model.columns = 1024;
     model.max_range_m = 120.0;
+  } else if (name == "Livox-Avia") {
+    AppendBeams(model.elevations_rad, 194, 38.6, -38.6);
+    model.columns = 900;
+    model.half_view_rad = kRadPerDeg * 35.2;
+    model.share = 0.7;  // 24 000 points in a tenth of a second
+    model.max_range_m = 120.0;
   } else {
-    throw std::invalid_argument("unknown sensor '" + name + "': use HDL-64E, HDL-32E, VLP-16 or OS1-128");
+    throw std::invalid_argument("unknown sensor '" + name + "': use HDL-64E, HDL-32E, VLP-16, OS1-128 or Livox-Avia");
   }
   return model;
 }

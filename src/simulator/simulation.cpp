@@ -40,22 +40,28 @@ TownParameters TownOf(const SimulationOptions& options) {
   return town;
 }
 
-// The sensor upright on the ground, which the vehicle's suspension follows with small slow errors.
+// The sensor upright on the ground.
+Pose UprightPose(const RouteFrame& frame, const Terrain& terrain, double height_m) {
+  const Eigen::Vector3d up = terrain.Normal(frame.position_m);
+  const Eigen::Vector3d heading(std::cos(frame.yaw_rad), std::sin(frame.yaw_rad), 0.0);
+  const Eigen::Vector3d x = (heading - up * up.dot(heading)).normalized();
+  Pose pose = Pose::Identity();
+  pose.linear() << x, up.cross(x), up;
+  pose.translation() << frame.position_m, terrain.Height(frame.position_m.x(), frame.position_m.y()) + height_m;
+  return pose;
+}
+
+// The same with what the vehicle's suspension adds: small slow errors.
 Pose SensorPose(const RouteFrame& frame, const Terrain& terrain, double height_m, std::uint64_t seed) {
   const double time_s = 1e-9 * static_cast<double>(frame.stamp_ns);
   const auto sway = [&](std::uint64_t which, double hertz) {
     return std::sin(kTwoPi * (hertz * time_s + ToUnit(HashOf(seed, which)))) +
            0.6 * std::sin(kTwoPi * (1.618 * hertz * time_s + ToUnit(HashOf(seed, which + 100))));
   };
-  const Eigen::Vector3d up = terrain.Normal(frame.position_m);
-  const Eigen::Vector3d heading(std::cos(frame.yaw_rad), std::sin(frame.yaw_rad), 0.0);
-  const Eigen::Vector3d x = (heading - up * up.dot(heading)).normalized();
-  Pose pose = Pose::Identity();
-  pose.linear() << x, up.cross(x), up;
+  Pose pose = UprightPose(frame, terrain, height_m);
   pose.linear() = pose.linear() * Eigen::AngleAxisd(0.002 * sway(1, 0.9), Eigen::Vector3d::UnitY()).toRotationMatrix() *
                   Eigen::AngleAxisd(0.002 * sway(2, 0.7), Eigen::Vector3d::UnitX()).toRotationMatrix();
-  pose.translation() << frame.position_m,
-      terrain.Height(frame.position_m.x(), frame.position_m.y()) + height_m + 0.008 * sway(3, 1.3);
+  pose.translation().z() += 0.008 * sway(3, 1.3);
   return pose;
 }
 
@@ -115,6 +121,7 @@ class Simulation::Impl {
     sensor_.range_noise_m = options.range_noise_m;
     sensor_.dropout = options.dropout;
     const std::uint64_t own_seed = HashOf(options.seed, 5005, options.day);
+    start_ = UprightPose(route_.front(), town_.terrain(), options.sensor_height_m);
     std::vector<Pose> truth;
     for (const RouteFrame& frame : route_)
       truth.push_back(SensorPose(frame, town_.terrain(), options.sensor_height_m, own_seed));
@@ -147,6 +154,7 @@ class Simulation::Impl {
       for (std::size_t column = 0; column < columns; ++column, ++k) {
         if (!(sweep.range_m[k] < max_range)) continue;
         const std::uint64_t hash = Mix(seed + k);
+        if (sensor_.share < 1.0 && ToUnit(Mix(hash + 2)) >= sensor_.share) continue;
         const float cosine = sweep.cos_incidence[k];
         const float share = sweep.range_m[k] / max_range;
         if (static_cast<float>(ToUnit(Mix(hash))) < LossOf(sweep.material[k], cosine, share, dropout)) continue;
@@ -168,6 +176,7 @@ class Simulation::Impl {
   Caster caster_;
   std::vector<StampNs> stamps_;
   std::vector<double> town_times_s_;
+  Pose start_ = Pose::Identity();
   std::vector<Pose> truth_;
   std::vector<Pose> odometry_;
 };
@@ -185,6 +194,9 @@ StampNs Simulation::stamp_ns(std::size_t i) const {
 }
 const Pose& Simulation::T_world_sensor(std::size_t i) const {
   return impl_->truth_.at(i);
+}
+const Pose& Simulation::T_world_start() const {
+  return impl_->start_;
 }
 const Pose& Simulation::T_odom_sensor(std::size_t i) const {
   return impl_->odometry_.at(i);

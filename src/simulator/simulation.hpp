@@ -52,7 +52,10 @@ class Simulation {
   std::size_t size() const;  ///< number of scans
   StampNs stamp_ns(std::size_t i) const;
   const Pose& T_world_sensor(std::size_t i) const;  ///< truth, in the town's gravity-aligned frame
-  const Pose& T_odom_sensor(std::size_t i) const;   ///< odometry that drifts, in a gravity-aligned frame of its own
+  /// Where the route begins, without the sway of a day: the origin of the poses that are written, so that the drives of
+  /// all days are in one frame.
+  const Pose& T_world_start() const;
+  const Pose& T_odom_sensor(std::size_t i) const;  ///< odometry that drifts, in a gravity-aligned frame of its own
 
   Points Scan(std::size_t i);  ///< in the sensor's frame
   SimulatedScan ScanWithIntensities(std::size_t i);

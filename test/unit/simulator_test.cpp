@@ -8,7 +8,9 @@
 #include <filesystem>
 #include <fstream>
 #include <limits>
+#include <set>
 #include <sstream>
+#include <utility>
 
 #include "simulator/caster.hpp"
 #include "simulator/kitti_writer.hpp"
@@ -96,6 +98,63 @@ TEST(SimulationTest, AnotherDayKeepsTheTownAndChangesTheCars) {
   ASSERT_GT(spots, 50u);
   EXPECT_GT(changed, spots / 5);
   EXPECT_LT(changed, spots * 4 / 5);
+}
+
+TEST(SimulationTest, AllDaysAndPartsOfARouteShareAFrame) {
+  SimulationOptions options = Options("loops");
+  const Simulation today(options);
+  options.day = 1;
+  options.first_frame = 300;
+  const Simulation tomorrow(options);
+  EXPECT_TRUE(today.T_world_start().matrix() == tomorrow.T_world_start().matrix());
+  // The sensor stands at the beginning of the route but for the sway of its suspension.
+  const Pose sway = today.T_world_start().inverse() * today.T_world_sensor(0);
+  EXPECT_LT(sway.translation().norm(), 0.02);
+  EXPECT_LT(Eigen::AngleAxisd(sway.linear()).angle(), 0.01);
+}
+
+TEST(SimulationTest, SensorsWithANarrowViewSeeNothingBeside) {
+  SimulationOptions options = Options("loops", "Livox-Avia");
+  Simulation simulation(options);
+  const Points first = simulation.Scan(0), second = simulation.Scan(1);
+  EXPECT_GT(first.size(), 10000u);
+  EXPECT_LT(first.size(), 25000u);
+  for (const Eigen::Vector3f& p : first) EXPECT_LT(std::abs(std::atan2(p.y(), p.x())), 0.62f);
+  // The pattern does not repeat: most directions of one scan are none of the next.
+  std::set<std::pair<int, int>> directions;
+  const auto direction = [](const Eigen::Vector3f& p) {
+    const double per_step = 180.0 / 3.14159265358979323846 / 0.4;
+    return std::make_pair(static_cast<int>(std::lround(per_step * std::atan2(p.y(), p.x()))),
+                          static_cast<int>(std::lround(per_step * std::atan2(p.z(), p.head<2>().norm()))));
+  };
+  for (const Eigen::Vector3f& p : first) directions.insert(direction(p));
+  std::size_t again = 0;
+  for (const Eigen::Vector3f& p : second) again += directions.count(direction(p));
+  EXPECT_GT(again, second.size() / 2);
+  EXPECT_LT(again, second.size() * 9 / 10) << "seven tenths of the beams fire, other ones every time";
+}
+
+TEST(SimulationTest, TheOppositeRouteHasMoreThan300RevisitsAgainstTheEarlierPass) {
+  const Simulation simulation(Options("opposite"));  // every second frame
+  // A step counts if some earlier one, a minute and 50 m of path ago, is within 5 m; the route is driven there and
+  // back.
+  std::size_t revisits = 0;
+  for (std::size_t i = 0; i < simulation.size(); ++i) {
+    double nearest_m = 5.0, path_m = 0.0;
+    std::size_t target = i;
+    for (std::size_t k = i; k-- > 0;) {
+      path_m += (simulation.T_world_sensor(k + 1).translation() - simulation.T_world_sensor(k).translation()).norm();
+      const double distance_m =
+          (simulation.T_world_sensor(i).translation() - simulation.T_world_sensor(k).translation()).norm();
+      if (simulation.stamp_ns(i) - simulation.stamp_ns(k) <= 60000000000 || path_m <= 50.0 || distance_m > nearest_m)
+        continue;
+      nearest_m = distance_m;
+      target = k;
+    }
+    revisits += target != i && simulation.T_world_sensor(i).linear().col(0).dot(
+                                   simulation.T_world_sensor(target).linear().col(0)) < 0.0;
+  }
+  EXPECT_GE(revisits, 300u);
 }
 
 TEST(SimulationTest, ParkedCarsChangeOnlyBetweenVisitsAMinuteApart) {
@@ -385,7 +444,7 @@ TEST(KittiWriterTest, RoundTrip) {
   ASSERT_EQ(camera.size(), 6u);
   ASSERT_EQ(odometry.size(), 6u);
   for (std::size_t i = 0; i < 6; ++i) {
-    const Pose expected = simulation.T_world_sensor(0).inverse() * simulation.T_world_sensor(i);
+    const Pose expected = simulation.T_world_start().inverse() * simulation.T_world_sensor(i);
     EXPECT_TRUE((Tr.inverse() * camera[i] * Tr).matrix().isApprox(expected.matrix(), 1e-9));
     EXPECT_TRUE(odometry[i].matrix().isApprox(simulation.T_odom_sensor(i).matrix(), 1e-9));
   }
