@@ -5,17 +5,22 @@
 #include <cstdio>
 #include <filesystem>
 #include <fstream>
+#include <functional>
 #include <memory>
 #include <mutex>
 #include <stdexcept>
 #include <string>
 #include <thread>
+#include <utility>
 #include <vector>
 
+#include "apps/progress_bar.hpp"
 #include "apps/simulated_drive.hpp"
 #include "apps/simulation_options.hpp"
 #include "evaluation/evaluation.hpp"
+#include "evaluation/kitti_io.hpp"
 #include "evaluation/run_table.hpp"
+#include "evaluation/thesis_page.hpp"
 
 namespace incremental_segmatch::apps {
 namespace {
@@ -80,6 +85,17 @@ DriveName ParseDrive(const std::string& text) {
   if (words.size() > 2) drive.max_scans = ParseCount(words[2], text);
   for (std::size_t i = 1; i < words.size(); ++i) drive.name += "_" + words[i];
   return drive;
+}
+
+simulator::SimulationOptions OptionsOf(const SimulationArguments& arguments, const DriveName& drive,
+                                       std::uint64_t seed) {
+  simulator::SimulationOptions options = arguments.Resolve();
+  options.route = drive.route;
+  options.poses_file = drive.poses_file;
+  options.first_frame = drive.first_frame;
+  options.max_scans = drive.max_scans;
+  options.seed = seed;
+  return options;
 }
 
 struct Run {
@@ -152,12 +168,7 @@ void RunMatrix(const MatrixArguments& arguments) {
       Run run;
       run.name = drive.name + " seed " + std::to_string(seed);
       run.folder = arguments.out + "/" + drive.name + "_seed" + std::to_string(seed);
-      run.simulation = arguments.simulation.Resolve();
-      run.simulation.route = drive.route;
-      run.simulation.poses_file = drive.poses_file;
-      run.simulation.first_frame = drive.first_frame;
-      run.simulation.max_scans = drive.max_scans;
-      run.simulation.seed = seed;
+      run.simulation = OptionsOf(arguments.simulation, drive, seed);
       runs.push_back(run);
       groups.back().summaries.push_back(run.folder + "/summary.json");
     }
@@ -193,12 +204,123 @@ void AddMatrixCommand(CLI::App& experiment) {
   command->callback([arguments] { RunMatrix(*arguments); });
 }
 
+struct ThesisArguments {
+  SimulationArguments simulation;
+  std::vector<std::string> drives;
+  std::uint64_t seed = 1;
+  std::string kitti_root;
+  std::vector<std::string> sequences;  ///< pairs: of the map, and to localize in it
+  std::string config;
+  std::string out;
+};
+
+// A drive for the map, and one to localize in it.
+struct DrivePair {
+  std::string name;
+  std::function<std::unique_ptr<DriveSource>()> map_drive;
+  std::function<std::unique_ptr<DriveSource>()> query_drive;
+};
+
+DrivePair SimulatedPair(const ThesisArguments& arguments, const std::string& text) {
+  const DriveName drive = ParseDrive(text);
+  const auto simulated = [=](std::uint64_t day) {
+    simulator::SimulationOptions options = OptionsOf(arguments.simulation, drive, arguments.seed);
+    options.day = day;
+    return std::make_unique<SimulatedDrive>(options);
+  };
+  return {drive.name, [=] { return simulated(0); }, [=] { return simulated(1); }};
+}
+
+DrivePair KittiPair(const std::string& root, const std::string& map_sequence, const std::string& query_sequence) {
+  const auto recorded = [=](const std::string& sequence) {
+    KittiDriveOptions options{root, sequence, {}};
+    if (HasKittiOdometry(root, sequence)) options.odometry_file = "odometry.txt";
+    return std::make_unique<KittiDrive>(options);
+  };
+  return {query_sequence + "_in_" + map_sequence, [=] { return recorded(map_sequence); },
+          [=] { return recorded(query_sequence); }};
+}
+
+ThesisRun RunExperiment(const std::string& name, DriveSource& drive, const EvaluationParameters& parameters,
+                        const std::string& out) {
+  ThesisRun run;
+  run.drive = name;
+  run.is_localization = parameters.core.back_end.mode == Mode::kLocalization;
+  const std::string folder = name + (run.is_localization ? "_localization" : "_loop_closure");
+  run.report = folder + "/report.html";
+  {
+    ProgressBar bar(folder, drive.size());
+    run.result =
+        incremental_segmatch::Evaluate(drive, parameters, [&](std::size_t done, std::size_t) { bar.Update(done); });
+  }
+  WriteResults(run.result, parameters, out + "/" + folder);
+  return run;
+}
+
+void RunThesis(const ThesisArguments& arguments) {
+  std::vector<DrivePair> pairs;
+  for (const std::string& drive : arguments.drives) pairs.push_back(SimulatedPair(arguments, drive));
+  for (std::size_t i = 0; i + 1 < arguments.sequences.size(); i += 2)
+    pairs.push_back(KittiPair(arguments.kitti_root, arguments.sequences[i], arguments.sequences[i + 1]));
+  if (pairs.empty())
+    throw std::invalid_argument("experiment thesis needs --drives, or --kitti and pairs of --sequences");
+  fs::create_directories(arguments.out);
+  std::vector<ThesisRun> runs;
+  for (const DrivePair& pair : pairs) {
+    EvaluationParameters parameters;
+    if (!arguments.config.empty()) parameters.core = LoadParameters(arguments.config);
+    parameters.pipeline = Pipeline::kBoth;
+    parameters.core.back_end.mode = Mode::kLoopClosure;
+    parameters.save_map = arguments.out + "/" + pair.name + ".map";
+    runs.push_back(RunExperiment(pair.name, *pair.map_drive(), parameters, arguments.out));
+    parameters.core.back_end.mode = Mode::kLocalization;
+    parameters.map_file = std::exchange(parameters.save_map, {});
+    parameters.map_truth = runs.back().result.truth;
+    runs.push_back(RunExperiment(pair.name, *pair.query_drive(), parameters, arguments.out));
+  }
+  WriteText(arguments.out + "/thesis.html", ThesisPage(runs));
+  std::printf("written to %s: thesis.html, and a folder for each run with its report.html\n", arguments.out.c_str());
+}
+
+void AddThesisCommand(CLI::App& experiment) {
+  const auto arguments = std::make_shared<ThesisArguments>();
+  CLI::App* command = experiment.add_subcommand(
+      "thesis",
+      "The thesis's two KITTI experiments, loop closure and localization, both beside the batch pipeline, on one "
+      "page:\n"
+      "thesis.html has what was found, speed-ups per stage, and the curve of distances between localizations.\n"
+      "Simulated drives: the map is of the first day, the drive to localize of the second, whose parked cars, "
+      "traffic,\n"
+      "noise and drift are others.\n\n"
+      "  segmatch experiment thesis --drives kitti/05.txt kitti/06.txt --stride 2 --out thesis\n"
+      "  segmatch experiment thesis --kitti data --sequences 00 01 --out thesis     localizes 01 in the map of 00\n");
+  command->add_option("--drives", arguments->drives,
+                      "preset routes or KITTI pose files, with :FIRST_FRAME:SCANS a part of them");
+  CLI::Option* kitti =
+      command->add_option("--kitti", arguments->kitti_root, "folder that holds sequences/ and poses/ (ROOT)");
+  CLI::Option* sequences =
+      command
+          ->add_option("--sequences", arguments->sequences,
+                       "pairs of sequences: of the map, and to localize in it; their poses must be in one frame")
+          ->needs(kitti);
+  kitti->needs(sequences);
+  command->add_option("--seed", arguments->seed, "of town, noise and drift")->capture_default_str();
+  command->add_option("--out", arguments->out, "folder to write into; made if need be")->required();
+  command->add_option("--config", arguments->config, "YAML with parameters that differ from the defaults");
+  AddSensorOptions(*command, &arguments->simulation);
+  command->callback([arguments] {
+    if (arguments->sequences.size() % 2 != 0) throw CLI::ValidationError("--sequences", "give pairs");
+    RunThesis(*arguments);
+  });
+}
+
 }  // namespace
 
 void AddExperimentCommand(CLI::App& app) {
-  CLI::App* command = app.add_subcommand("experiment", "Sets of runs on simulated drives, in one table.");
+  CLI::App* command = app.add_subcommand("experiment", "Sets of runs, and the table or page that comes of them.");
   command->require_subcommand(1);
   AddMatrixCommand(*command);
+  AddThesisCommand(*command);
 }
 
 }  // namespace incremental_segmatch::apps

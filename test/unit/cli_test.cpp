@@ -235,8 +235,8 @@ TEST_F(Drive, BatchBesideIncremental) {
   EXPECT_HAS(run.output, "segmentation, tree included");
   const std::vector<std::string> steps = Lines(Out("both/steps.csv"));
   ASSERT_EQ(steps.size(), 5u);
-  for (const std::string column : {"total_ms", "batch_total_ms", "batch_voxel_grid_ms", "batch_tree_ms", "batch_segmentation_ms",
-                                   "batch_recognition_ms", "batch_segments"})
+  for (const std::string column : {"total_ms", "batch_total_ms", "batch_voxel_grid_ms", "batch_tree_ms",
+                                   "batch_segmentation_ms", "batch_recognition_ms", "batch_segments"})
     EXPECT_HAS("," + steps[0] + ",", "," + column + ",");
   for (const std::string& row : steps)
     EXPECT_EQ(std::count(row.begin(), row.end(), ','), std::count(steps[0].begin(), steps[0].end(), ','));
@@ -247,11 +247,24 @@ TEST_F(Drive, BatchBesideIncremental) {
   EXPECT_GT(comparison.back()["batch_median_ms"], 0.0);
 
   const std::string config = directory_.Write("smooth.yaml", "front_end:\n  segmentation: smoothness\n");
-  EXPECT_HAS(Segmatch(drive + "--pipeline both --config " + config + " --out " + Out("smooth")).output, "normals, tree shared");
+  EXPECT_HAS(Segmatch(drive + "--pipeline both --config " + config + " --out " + Out("smooth")).output,
+             "normals, tree shared");
   const Outcome batch = Segmatch(drive + "--pipeline batch --out " + Out("batch"));
   ASSERT_EQ(batch.status, 0) << batch.output;
   EXPECT_HAS(batch.output, "segment_clouds");
   EXPECT_NE(Segmatch(drive + "--pipeline none --out " + Out("none")).status, 0);
+}
+
+TEST_F(Drive, ThesisExperimentsWriteOnePage) {
+  const Outcome run = Segmatch("experiment thesis --drives lap:0:3 --sensor VLP-16 --kitti " + directory_.path() +
+                               " --sequences 07 07 --out " + Out("t"));
+  ASSERT_EQ(run.status, 0) << run.output;
+  for (const std::string name : {"lap_0_3_loop_closure", "lap_0_3_localization", "07_in_07_localization"})
+    EXPECT_TRUE(std::filesystem::exists(Out("t/" + name + "/report.html"))) << name;
+  EXPECT_TRUE(std::filesystem::exists(Out("t/thesis.html")));
+  EXPECT_HAS(Lines(Out("t/lap_0_3_localization/steps.csv"))[0], "batch_voxel_grid_ms");
+  EXPECT_NE(Segmatch("experiment thesis --kitti " + directory_.path() + " --sequences 07 --out " + Out("t")).status, 0);
+  EXPECT_NE(Segmatch("experiment thesis --out " + Out("t")).status, 0);
 }
 
 }  // namespace

@@ -12,6 +12,7 @@
 #include "evaluation/analysis.hpp"
 #include "evaluation/html_report.hpp"
 #include "evaluation/run_table.hpp"
+#include "evaluation/thesis_page.hpp"
 #include "support/temporary_directory.hpp"
 
 namespace incremental_segmatch {
@@ -206,6 +207,24 @@ TEST(Report, ComesOfRunsWithoutTruthAndWithoutSteps) {
   EvaluationResult nothing;
   nothing.drive = "nothing";
   EXPECT_EQ(OpenElements(ReportHtml(nothing)), "");
+}
+
+TEST(ThesisPage, ShowsBothExperimentsBesideTheThesis) {
+  std::vector<ThesisRun> runs;
+  for (const bool is_localization : {false, true}) {
+    runs.push_back({"the <drive>", is_localization, "folder/report.html", RandomResult(is_localization ? 5 : 4)});
+    for (StepRecord& step : runs.back().result.steps) {
+      // Eight times as long for the grid, in every step.
+      step.stages = {{"voxel_insertion", 0.5}};
+      step.batch.emplace();
+      step.batch->stages = {{"voxel_grid", 4.0}};
+    }
+  }
+  const std::string page = ThesisPage(runs);
+  EXPECT_EQ(OpenElements(page), "");
+  EXPECT_NE(page.find("the &lt;drive&gt;, localization"), std::string::npos);
+  EXPECT_NE(page.find("<td>8.0 (4.00 / 0.500 ms)</td><td>8.0 (4.00 / 0.500 ms)</td><td>8.08</td>"), std::string::npos);
+  EXPECT_NE(page.find("<td>" + std::to_string(runs[1].result.score->true_closures) + "</td>"), std::string::npos);
 }
 
 TEST(RunTable, GivesMeanAndRangeOverRuns) {

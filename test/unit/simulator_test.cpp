@@ -8,6 +8,7 @@
 #include <filesystem>
 #include <fstream>
 #include <limits>
+#include <map>
 #include <set>
 #include <sstream>
 #include <utility>
@@ -134,27 +135,31 @@ TEST(SimulationTest, SensorsWithANarrowViewSeeNothingBeside) {
   EXPECT_LT(again, second.size() * 9 / 10) << "seven tenths of the beams fire, other ones every time";
 }
 
-TEST(SimulationTest, TheOppositeRouteHasMoreThan300RevisitsAgainstTheEarlierPass) {
-  const Simulation simulation(Options("opposite"));  // every second frame
-  // A step counts if some earlier one, a minute and 50 m of path ago, is within 5 m; the route is driven there and
-  // back.
-  std::size_t revisits = 0;
-  for (std::size_t i = 0; i < simulation.size(); ++i) {
-    double nearest_m = 5.0, path_m = 0.0;
-    std::size_t target = i;
-    for (std::size_t k = i; k-- > 0;) {
-      path_m += (simulation.T_world_sensor(k + 1).translation() - simulation.T_world_sensor(k).translation()).norm();
-      const double distance_m =
-          (simulation.T_world_sensor(i).translation() - simulation.T_world_sensor(k).translation()).norm();
-      if (simulation.stamp_ns(i) - simulation.stamp_ns(k) <= 60000000000 || path_m <= 50.0 || distance_m > nearest_m)
-        continue;
-      nearest_m = distance_m;
-      target = k;
+TEST(SimulationTest, TheDeceptiveStreetIsOfEqualThingsAtEqualDistances) {
+  const Simulation simulation(Options("deceptive"));
+  const Town& town = simulation.town();
+  // What stands at the street, by kind: everything has one and the same make.
+  std::map<ItemKind, std::set<std::uint64_t>> makes;
+  std::map<ItemKind, std::vector<Eigen::Vector2d>> places;
+  for (std::size_t i = 0; i < town.plan().size(); ++i) {
+    const Item& item = town.plan()[i];
+    if (town.trajectory().Distance(item.footprint, 12.0) >= 12.0) continue;
+    makes[item.kind].insert(item.seed);
+    places[item.kind].push_back(item.footprint.centre_m);
+    for (double time_s = 0.0; item.kind == ItemKind::kParkingSpot && time_s < 400.0; time_s += 20.0) {
+      if (const std::optional<Item> parked = town.ParkedAt(i, time_s)) makes[ItemKind::kVehicle].insert(parked->seed);
     }
-    revisits += target != i && simulation.T_world_sensor(i).linear().col(0).dot(
-                                   simulation.T_world_sensor(target).linear().col(0)) < 0.0;
   }
-  EXPECT_GE(revisits, 300u);
+  for (const ItemKind kind : {ItemKind::kHouse, ItemKind::kTree, ItemKind::kParkingSpot, ItemKind::kVehicle})
+    EXPECT_EQ(makes[kind].size(), 1u) << static_cast<int>(kind);
+  ASSERT_GT(places[ItemKind::kHouse].size(), 60u);
+  // Houses repeat every sixteen metres.
+  std::size_t in_step = 0;
+  for (const Eigen::Vector2d& house : places[ItemKind::kHouse]) {
+    in_step += std::any_of(places[ItemKind::kHouse].begin(), places[ItemKind::kHouse].end(),
+                           [&](const auto& other) { return std::abs((other - house).norm() - 16.0) < 0.05; });
+  }
+  EXPECT_GT(in_step, places[ItemKind::kHouse].size() * 3 / 4);
 }
 
 TEST(SimulationTest, ParkedCarsChangeOnlyBetweenVisitsAMinuteApart) {
