@@ -28,7 +28,7 @@ p.note, li, figcaption { color: var(--soft); font-size: .9rem; }
 .tile b { display: block; font-size: 1.2rem; font-weight: 600; }
 .tile span { color: var(--soft); font-size: .82rem; }
 .tile b span { color: inherit; font-size: inherit; } .tile.good b { color: var(--true); } .tile.bad b { color: var(--false); }
-figure { margin: .5rem 0; } figure.plot { max-width: 42rem; } svg { width: 100%; height: auto; display: block; }
+a { color: var(--blue); } figure { margin: .5rem 0; } figure.plot { max-width: 42rem; } svg { width: 100%; height: auto; display: block; }
 .table { overflow-x: auto; } table { border-collapse: collapse; font-size: .88rem; width: 100%; }
 th, td { padding: .25rem .6rem; border-bottom: 1px solid var(--rule); text-align: right; vertical-align: top;
   font-variant-numeric: tabular-nums; }

@@ -99,33 +99,38 @@ void Svg::Text(double x, double y, const std::string& text, const std::string& a
 }
 
 std::string Draw(const Plot& plot) {
-  constexpr double kWidth = 460, kHeight = 270, kLeft = 40, kRight = 66, kTop = 26, kBottom = 44;
+  constexpr double kWidth = 460, kHeight = 270, kLeft = 40, kTop = 26, kBottom = 44, kPerLetter = 6.8;
+  std::size_t letters = 0;
+  for (const Curve& curve : plot.curves) letters = std::max(letters, curve.name.size());
+  const double right = std::max(30.0, 10.0 + kPerLetter * static_cast<double>(letters));
   const double x_max = plot.x_max > 0.0 ? plot.x_max : 1.0, y_max = plot.y_max > 0.0 ? plot.y_max : 1.0;
-  const auto x_of = [&](double x) { return kLeft + (kWidth - kLeft - kRight) * std::min(x, x_max) / x_max; };
+  const auto x_of = [&](double x) { return kLeft + (kWidth - kLeft - right) * std::min(x, x_max) / x_max; };
   const auto y_of = [&](double y) {
     return kHeight - kBottom - (kHeight - kTop - kBottom) * std::min(y, y_max) / y_max;
   };
   Svg svg(kWidth, kHeight, plot.title);
   const double x_step = TickStep(x_max), y_step = TickStep(y_max);
   for (double y = 0.0; y <= y_max * (1 + 1e-9); y += y_step) {
-    svg.Line(kLeft, y_of(y), kWidth - kRight, y_of(y), "grid");
+    svg.Line(kLeft, y_of(y), kWidth - right, y_of(y), "grid");
     svg.Text(kLeft - 6, y_of(y) + 4, FormatNumber(y, "%.3g"), "end");
   }
   for (double x = 0.0; x <= x_max * (1 + 1e-9); x += x_step) {
     svg.Line(x_of(x), kHeight - kBottom, x_of(x), kHeight - kBottom + 4, "axis");
     svg.Text(x_of(x), kHeight - kBottom + 17, FormatNumber(x, "%.3g"), "middle");
   }
-  svg.Line(kLeft, kHeight - kBottom, kWidth - kRight, kHeight - kBottom, "axis");
-  svg.Text(0.5 * (kLeft + kWidth - kRight), kHeight - 8, plot.x_label, "middle");
+  svg.Line(kLeft, kHeight - kBottom, kWidth - right, kHeight - kBottom, "axis");
+  svg.Text(0.5 * (kLeft + kWidth - right), kHeight - 8, plot.x_label, "middle");
   svg.Text(kLeft - 34, 12, plot.y_label, "start");
   double word_end = 0.0;
   int level = 0;
   for (const auto& [x, word] : plot.x_marks) {
     if (!(x <= x_max)) continue;
     level = x_of(x) < word_end ? level + 1 : 0;
-    word_end = x_of(x) + 7.0 * static_cast<double>(word.size());
+    const double width = kPerLetter * static_cast<double>(word.size());
+    const bool fits = x_of(x) + width < kWidth;
+    word_end = x_of(x) + (fits ? width : 0.0);
     svg.Line(x_of(x), kTop, x_of(x), kHeight - kBottom, "mark");
-    svg.Text(x_of(x) + 4, kTop + 12 + 14 * level, word, "start");
+    svg.Text(x_of(x) + (fits ? 4 : -4), kTop + 12 + 14 * level, word, fits ? "start" : "end");
   }
   double last_label = -100.0;
   for (const Curve& curve : plot.curves) {
@@ -136,7 +141,7 @@ std::string Draw(const Plot& plot) {
     double y = points.back().y() + 4;
     if (std::abs(y - last_label) < 14) y = last_label + 14;
     last_label = y;
-    svg.Text(kWidth - kRight + 6, y, curve.name, "start", "label ink-" + curve.style_class);
+    svg.Text(kWidth - right + 6, y, curve.name, "start", "label ink-" + curve.style_class);
   }
   return svg.Finish();
 }
