@@ -1,9 +1,17 @@
 #include "incremental_segmatch/dynamic_voxel_grid.hpp"
 
 #include <algorithm>
+#include <limits>
 #include <stdexcept>
 #include <string>
 #include <unordered_map>
+
+// Compiled for processors with AVX2 as well, and chosen at run time; the results are the same.
+#if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__gnu_linux__)
+#define SEGMATCH_SEVERAL_TARGETS __attribute__((target_clones("avx2", "default")))
+#else
+#define SEGMATCH_SEVERAL_TARGETS
+#endif
 
 namespace incremental_segmatch {
 namespace {
@@ -177,113 +185,173 @@ DynamicVoxelGrid::~DynamicVoxelGrid() = default;
 DynamicVoxelGrid::DynamicVoxelGrid(DynamicVoxelGrid&&) noexcept = default;
 DynamicVoxelGrid& DynamicVoxelGrid::operator=(DynamicVoxelGrid&&) noexcept = default;
 
+/// A chunk of points on their way into their voxels, by coordinate, so that compilers take several points at a time.
+struct DynamicVoxelGrid::Chunk {
+  static constexpr std::size_t kSize = 128;
+
+  std::size_t count = 0;
+  std::array<std::array<float, kSize>, 3> points_sensor;
+  std::array<std::array<float, kSize>, 3> in_block;          ///< relative to the corner of their block
+  std::array<std::array<std::int32_t, kSize>, 3> coordinates;  ///< of their block
+  std::array<std::uint32_t, kSize> cell;
+  std::array<std::uint32_t, kSize> inside;  ///< 0 for points that have no voxel
+};
+
+/// Points of one voxel that follow each other in the scan.
+struct DynamicVoxelGrid::Run {
+  std::uint32_t slot, cell, count;
+  Eigen::Vector3f sum_block;
+};
+
 VoxelUpdate DynamicVoxelGrid::Insert(const Points& points_sensor, const Pose& T_odom_sensor) {
   // Blocks lie anywhere in memory. A chunk of points at a time, everything that a pass over the chunk needs was asked for by the
   // pass before it, so that the fetches overlap instead of following each other.
-  constexpr std::size_t kChunk = 128;
   VoxelUpdate update;
-  std::array<Located, kChunk> located;
-  const Pose T_grid_sensor = T_odom_grid_.inverse() * T_odom_sensor;
-  touched_.clear();
-  for (std::size_t begin = 0; begin < points_sensor.size(); begin += kChunk) {
-    const std::size_t end = std::min(begin + kChunk, points_sensor.size());
-    const std::size_t count = Locate(points_sensor.data() + begin, end - begin, T_grid_sensor, located.data(), &update);
-    std::uint64_t last_key = ~std::uint64_t{0};
-    std::uint32_t slot = kNoBlock;
-    for (std::size_t i = 0; i < count; ++i) {
-      const std::uint64_t key = PackBlock(located[i].coordinates);
-      if (key != last_key) {
-        slot = block_map_->Find(key);
-        if (slot == kNoBlock) slot = AddBlock(located[i].coordinates);
-        last_key = key;
-      }
-      located[i].slot = slot;
-      __builtin_prefetch(&block(slot));
-      __builtin_prefetch(&block(slot).voxels[located[i].cell], 1);
-    }
-    for (std::size_t i = 0; i < count; ++i) AddPoint(located[i]);
+  Chunk chunk;
+  std::array<Run, Chunk::kSize> runs;
+  const CellTransform transform = CellTransformOf(T_odom_sensor);
+  touched_inactive_.clear();
+  update.moved.reserve(last_moved_ + last_moved_ / 8);
+  for (std::size_t begin = 0; begin < points_sensor.size(); begin += Chunk::kSize) {
+    chunk.count = std::min(Chunk::kSize, points_sensor.size() - begin);
+    for (std::size_t i = 0; i < chunk.count; ++i)
+      for (int axis = 0; axis < 3; ++axis) chunk.points_sensor[axis][i] = points_sensor[begin + i][axis];
+    Locate(transform, &chunk);
+    for (std::size_t i = 0; i < chunk.count; ++i)
+      block_map_->Prefetch(PackBlock({chunk.coordinates[0][i], chunk.coordinates[1][i], chunk.coordinates[2][i]}));
+    const std::size_t count = FindVoxels(chunk, runs.data(), &update);
+    for (std::size_t i = 0; i < count; ++i) AddRun(runs[i], &update);
   }
-  CollectTouched(&update);
+  SettleTouched(&update);
+  last_moved_ = update.moved.size();
   return update;
 }
 
-/// (3.3): finds block and cell of each point, drops those that have none, and returns how many are left.
-std::size_t DynamicVoxelGrid::Locate(const Eigen::Vector3f* points_sensor, std::size_t count, const Pose& T_grid_sensor,
-                                     Located* located, VoxelUpdate* update) const {
+DynamicVoxelGrid::CellTransform DynamicVoxelGrid::CellTransformOf(const Pose& T_odom_sensor) const {
+  const Pose T_grid_sensor = T_odom_grid_.inverse() * T_odom_sensor;
   const Eigen::Vector3d center(parameters_.center_m[0], parameters_.center_m[1], parameters_.center_m[2]);
   const double cells_per_m = 1.0 / parameters_.resolution_m;
-  const Eigen::Matrix3d R_cells = cells_per_m * T_grid_sensor.linear();
-  const Eigen::Vector3d t_cells = cells_per_m * (T_grid_sensor.translation() - center);
-  const std::array<double, 3> half_cells{std::ldexp(1.0, parameters_.bits[0] - 1), std::ldexp(1.0, parameters_.bits[1] - 1),
-                                         std::ldexp(1.0, parameters_.bits[2] - 1)};
-  const float resolution = static_cast<float>(parameters_.resolution_m);
-  Located* out = located;
-  for (const Eigen::Vector3f* point = points_sensor; point != points_sensor + count; ++point) {
-    const Eigen::Vector3f& p = *point;
-    std::array<double, 3> cells;
-    for (int axis = 0; axis < 3; ++axis)
-      cells[axis] = R_cells(axis, 0) * p[0] + R_cells(axis, 1) * p[1] + R_cells(axis, 2) * p[2] + t_cells[axis];
-    // Also false for NaN.
-    const bool inside = cells[0] >= -half_cells[0] && cells[0] < half_cells[0] && cells[1] >= -half_cells[1] &&
-                        cells[1] < half_cells[1] && cells[2] >= -half_cells[2] && cells[2] < half_cells[2];
-    if (!inside) {
-      ++(p.allFinite() ? update->dropped_outside : update->dropped_nonfinite);
+  CellTransform transform;
+  for (int row = 0; row < 3; ++row) {
+    for (int column = 0; column < 3; ++column) transform.R[row][column] = cells_per_m * T_grid_sensor.linear()(row, column);
+    transform.t[row] = cells_per_m * (T_grid_sensor.translation()[row] - center[row]);
+    transform.half_cells[row] = std::ldexp(1.0, parameters_.bits[row] - 1);
+  }
+  transform.resolution = static_cast<float>(parameters_.resolution_m);
+  return transform;
+}
+
+/// (3.3): block and cell of each point.
+SEGMATCH_SEVERAL_TARGETS
+void DynamicVoxelGrid::Locate(const CellTransform& transform, Chunk* chunk) {
+  const std::size_t count = chunk->count;
+  const float* const x = chunk->points_sensor[0].data();
+  const float* const y = chunk->points_sensor[1].data();
+  const float* const z = chunk->points_sensor[2].data();
+  std::uint32_t* const cell = chunk->cell.data();
+  std::uint32_t* const inside = chunk->inside.data();
+  for (std::size_t i = 0; i < count; ++i) cell[i] = 0;
+  for (std::size_t i = 0; i < count; ++i) inside[i] = 1;
+  for (int axis = 0; axis < 3; ++axis) {
+    const double rx = transform.R[axis][0], ry = transform.R[axis][1], rz = transform.R[axis][2], t = transform.t[axis];
+    const double low = -transform.half_cells[axis], high = transform.half_cells[axis];
+    float* const in_block = chunk->in_block[axis].data();
+    std::int32_t* const coordinate = chunk->coordinates[axis].data();
+    for (std::size_t i = 0; i < count; ++i) {
+      const double exact = rx * static_cast<double>(x[i]) + ry * static_cast<double>(y[i]) + rz * static_cast<double>(z[i]) + t;
+      double cells = exact >= low ? exact : low;  // also where it is no number
+      cells = cells < high ? cells : low;
+      std::int32_t index = static_cast<std::int32_t>(cells);
+      index -= cells < static_cast<double>(index) ? 1 : 0;  // floor
+      coordinate[i] = index >> 2;
+      cell[i] |= static_cast<std::uint32_t>(index & 3) << (2 * axis);
+      inside[i] &= cells == exact ? 1u : 0u;
+      in_block[i] = static_cast<float>(cells - static_cast<double>(index & ~3)) * transform.resolution;
+    }
+  }
+}
+
+/// Finds or adds the block of each point that has one, drops the others, and returns how many runs there are.
+std::size_t DynamicVoxelGrid::FindVoxels(const Chunk& chunk, Run* runs, VoxelUpdate* update) {
+  std::array<std::int32_t, 3> last{std::numeric_limits<std::int32_t>::min(), 0, 0};
+  std::uint32_t slot = kNoBlock;
+  Run* run = runs - 1;
+  for (std::size_t i = 0; i < chunk.count; ++i) {
+    if (!chunk.inside[i]) {
+      const bool finite = std::isfinite(chunk.points_sensor[0][i]) && std::isfinite(chunk.points_sensor[1][i]) &&
+                          std::isfinite(chunk.points_sensor[2][i]);
+      ++(finite ? update->dropped_outside : update->dropped_nonfinite);
       continue;
     }
-    out->cell = 0;
-    for (int axis = 0; axis < 3; ++axis) {
-      std::int32_t index = static_cast<std::int32_t>(cells[axis]);
-      index -= cells[axis] < index;  // floor
-      out->coordinates[axis] = index >> 2;
-      out->cell |= static_cast<unsigned>(index & 3) << (2 * axis);
-      out->in_block[axis] = static_cast<float>(cells[axis] - 4 * out->coordinates[axis]) * resolution;
+    const Eigen::Vector3f in_block(chunk.in_block[0][i], chunk.in_block[1][i], chunk.in_block[2][i]);
+    const std::array<std::int32_t, 3> coordinates{chunk.coordinates[0][i], chunk.coordinates[1][i], chunk.coordinates[2][i]};
+    if (coordinates != last) {
+      slot = block_map_->Find(PackBlock(coordinates));
+      if (slot == kNoBlock) slot = AddBlock(coordinates);
+      last = coordinates;
+    } else if (run->cell == chunk.cell[i]) {
+      ++run->count;
+      run->sum_block += in_block;
+      continue;
     }
-    block_map_->Prefetch(PackBlock(out->coordinates));
-    ++out;
+    *++run = {slot, chunk.cell[i], 1, in_block};
+    __builtin_prefetch(&block(slot));
+    __builtin_prefetch(&block(slot).voxels[chunk.cell[i]], 1);
   }
-  return static_cast<std::size_t>(out - located);
+  return static_cast<std::size_t>(run + 1 - runs);
 }
 
-void DynamicVoxelGrid::AddPoint(const Located& point) {
-  Block& home = block(point.slot);
-  Voxel& voxel = home.voxels[point.cell];
-  const std::uint64_t bit = std::uint64_t{1} << point.cell;
-  if (!(home.occupied & bit)) {
-    home.occupied |= bit;
-    voxel = {Eigen::Vector3f::Zero(), 0};
-    ++occupied_voxels_;
-  }
+/// While a voxel is touched its centroid is the sum of its points.
+void DynamicVoxelGrid::AddRun(const Run& run, VoxelUpdate* update) {
+  Block& home = block(run.slot);
+  Voxel& voxel = home.voxels[run.cell];
+  const std::uint64_t bit = std::uint64_t{1} << run.cell;
+  const VoxelHandle handle = run.slot * kCellsPerBlock + run.cell;
   if (!(home.touched & bit)) {
     home.touched |= bit;
-    touched_.push_back({point.slot * kCellsPerBlock + point.cell, (home.active & bit) != 0, voxel.centroid_block});
+    if (home.active & bit) {
+      update->moved.push_back({handle, voxel.centroid_block, Eigen::Vector3f::Zero()});
+    } else {
+      touched_inactive_.push_back(handle);
+      if (!(home.occupied & bit)) {
+        home.occupied |= bit;
+        voxel = {Eigen::Vector3f::Zero(), 0};
+        ++occupied_voxels_;
+      }
+    }
+    voxel.centroid_block *= static_cast<float>(voxel.count);
   }
-  // (3.4) for m = 1; repeated, it gives the mean of all points.
-  ++voxel.count;
-  voxel.centroid_block += (point.in_block - voxel.centroid_block) * (1.f / static_cast<float>(voxel.count));
+  voxel.centroid_block += run.sum_block;
+  voxel.count += run.count;
 }
 
-/// Reports what became of the voxels that got points.
-void DynamicVoxelGrid::CollectTouched(VoxelUpdate* update) {
+/// (3.4): sums become centroids. Reports what became of the voxels that got points.
+void DynamicVoxelGrid::SettleTouched(VoxelUpdate* update) {
   constexpr std::size_t kAhead = 16;
+  const auto prefetch = [this](VoxelHandle voxel) {
+    __builtin_prefetch(&block(voxel / kCellsPerBlock), 1);
+    __builtin_prefetch(&block(voxel / kCellsPerBlock).voxels[voxel % kCellsPerBlock], 1);
+  };
+  const auto settle = [this](VoxelHandle handle) -> const Voxel& {
+    Block& home = block(handle / kCellsPerBlock);
+    Voxel& voxel = home.voxels[handle % kCellsPerBlock];
+    home.touched &= ~(std::uint64_t{1} << (handle % kCellsPerBlock));
+    voxel.centroid_block *= 1.f / static_cast<float>(voxel.count);
+    return voxel;
+  };
+  std::vector<MovedVoxel>& moved = update->moved;
+  for (std::size_t i = 0; i < moved.size(); ++i) {
+    if (i + kAhead < moved.size()) prefetch(moved[i + kAhead].voxel);
+    moved[i].after_block = settle(moved[i].voxel).centroid_block;
+  }
   const std::uint32_t min_points = static_cast<std::uint32_t>(parameters_.min_points_per_voxel);
-  update->moved.reserve(touched_.size());
-  for (std::size_t i = 0; i < touched_.size(); ++i) {
-    if (i + kAhead < touched_.size()) {
-      const VoxelHandle ahead = touched_[i + kAhead].voxel;
-      __builtin_prefetch(&block(ahead / kCellsPerBlock), 1);
-      __builtin_prefetch(&block(ahead / kCellsPerBlock).voxels[ahead % kCellsPerBlock]);
-    }
-    const Touched& touched = touched_[i];
-    Block& home = block(touched.voxel / kCellsPerBlock);
-    const unsigned cell = touched.voxel % kCellsPerBlock;
-    const Voxel& voxel = home.voxels[cell];
-    home.touched &= ~(std::uint64_t{1} << cell);
-    if (touched.was_active) {
-      update->moved.push_back({touched.voxel, touched.before_block, voxel.centroid_block});
-    } else if (voxel.count >= min_points) {
-      home.active |= std::uint64_t{1} << cell;
-      update->activated.push_back(touched.voxel);
-    }
+  update->activated.reserve(touched_inactive_.size());
+  for (std::size_t i = 0; i < touched_inactive_.size(); ++i) {
+    const VoxelHandle handle = touched_inactive_[i];
+    if (i + kAhead < touched_inactive_.size()) prefetch(touched_inactive_[i + kAhead]);
+    if (settle(handle).count < min_points) continue;
+    block(handle / kCellsPerBlock).active |= std::uint64_t{1} << (handle % kCellsPerBlock);
+    update->activated.push_back(handle);
   }
   active_voxels_ += update->activated.size();
 }
@@ -393,7 +461,7 @@ std::size_t DynamicVoxelGrid::handle_capacity() const { return std::size_t{block
 
 std::size_t DynamicVoxelGrid::memory_bytes() const {
   return pages_.size() * kBlocksPerPage * sizeof(Block) + free_blocks_.capacity() * sizeof(std::uint32_t) +
-         block_map_->memory_bytes() + tiles_->memory_bytes() + touched_.capacity() * sizeof(Touched);
+         block_map_->memory_bytes() + tiles_->memory_bytes() + touched_inactive_.capacity() * sizeof(VoxelHandle);
 }
 
 bool DynamicVoxelGrid::IsActive(VoxelHandle voxel) const {

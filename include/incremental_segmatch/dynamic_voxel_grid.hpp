@@ -181,17 +181,20 @@ class DynamicVoxelGrid {
 
   Block& block(std::uint32_t slot) { return pages_[slot / kBlocksPerPage][slot % kBlocksPerPage]; }
   const Block& block(std::uint32_t slot) const { return pages_[slot / kBlocksPerPage][slot % kBlocksPerPage]; }
-  /// A point on its way into its voxel.
-  struct Located {
-    Eigen::Vector3f in_block;
-    std::array<std::int32_t, 3> coordinates;  ///< of its block
-    std::uint32_t cell;
-    std::uint32_t slot;
+  /// Points in the sensor's frame to cells, relative to the middle of the grid: R p + t.
+  struct CellTransform {
+    std::array<std::array<double, 3>, 3> R;
+    std::array<double, 3> t;
+    std::array<double, 3> half_cells;  ///< of the grid, per axis
+    float resolution;
   };
-  std::size_t Locate(const Eigen::Vector3f* points_sensor, std::size_t count, const Pose& T_grid_sensor,
-                     Located* located, VoxelUpdate* update) const;
-  void AddPoint(const Located& point);
-  void CollectTouched(VoxelUpdate* update);
+  struct Chunk;
+  struct Run;
+  CellTransform CellTransformOf(const Pose& T_odom_sensor) const;
+  static void Locate(const CellTransform& transform, Chunk* chunk);
+  std::size_t FindVoxels(const Chunk& chunk, Run* runs, VoxelUpdate* update);
+  void AddRun(const Run& run, VoxelUpdate* update);
+  void SettleTouched(VoxelUpdate* update);
   std::uint32_t FindBlock(const std::array<std::int32_t, 3>& coordinates) const;
   std::uint32_t AddBlock(const std::array<std::int32_t, 3>& coordinates);
   void RemoveBlock(std::uint32_t slot);
@@ -207,13 +210,8 @@ class DynamicVoxelGrid {
   std::unique_ptr<TileMap> tiles_;
   std::size_t active_voxels_ = 0;
   std::size_t occupied_voxels_ = 0;
-
-  struct Touched {
-    VoxelHandle voxel;
-    bool was_active;
-    Eigen::Vector3f before_block;
-  };
-  std::vector<Touched> touched_;  ///< work space of Insert
+  std::size_t last_moved_ = 0;  ///< in the last Insert
+  std::vector<VoxelHandle> touched_inactive_;  ///< work space of Insert
 };
 
 template <class Visit>
