@@ -115,12 +115,22 @@ void IncrementalNormals::Accumulate(const Position& p, Moments* moments) {
   moments->sum += kSign * p.xyz1.cast<int>();
 }
 
+/// Takes out what position a contributes and adds what b does, given b - a and a + b: b b - a a = (b - a) (b + a), and
+/// bx by - ax ay = ((bx - ax) (by + ay) + (by - ay) (bx + ax)) / 2. Exact as well.
+void IncrementalNormals::AccumulateMove(const Position& difference, const Position& sum, Moments* moments) {
+  moments->squares += (difference.xyz1 * sum.xyz1).cast<int>();
+  moments->products += (0.5f * (difference.xyz1 * sum.yzx1 + difference.yzx1 * sum.xyz1)).cast<int>();
+  moments->sum += difference.xyz1.cast<int>();
+}
+
 void IncrementalNormals::Remove(const std::vector<RemovedVoxel>& removed) {
   // All leave before any takes back what it gave: nobody cares for the accumulators of those that go along.
   leaving_.clear();
   for (const RemovedVoxel& gone : removed) {
     if (!IsAnchored(gone.voxel)) continue;
-    masks_[gone.voxel / kCells].anchored &= ~(std::uint64_t{1} << (gone.voxel % kCells));
+    Masks& home = masks_[gone.voxel / kCells];
+    home.anchored &= ~CellBit(gone.voxel);
+    home.overdue &= ~CellBit(gone.voxel);
     leaving_.push_back(gone.voxel);
   }
   for (const VoxelHandle voxel : leaving_) Replace<true, false>(voxel, Position());
@@ -130,16 +140,38 @@ void IncrementalNormals::Insert(const VoxelUpdate& update) {
   const std::size_t blocks = grid_->handle_capacity() / kCells;
   blocks_.Grow(blocks);
   if (masks_.size() < blocks) masks_.resize(blocks);
-  renewing_.clear();
   for (const MovedVoxel& moved : update.moved) {
+    Masks& home = masks_[moved.voxel / kCells];
+    if ((home.overdue & CellBit(moved.voxel)) != 0) continue;
     const Position position = PositionOf(moved.voxel, moved.after_block);
     const Position anchor = blocks_[moved.voxel / kCells].Anchor(moved.voxel % kCells);
-    if ((position - anchor).xyz1.matrix().squaredNorm() > tolerance2_units_) renewing_.push_back(moved.voxel);
+    if ((position - anchor).xyz1.matrix().squaredNorm() <= tolerance2_units_) continue;
+    home.overdue |= CellBit(moved.voxel);
+    grid_->ForEachStencilBlock(stencil_, moved.voxel, [&](std::uint32_t slot, const NeighbourStencil::BlockVisit& at) {
+      masks_[slot].stale |= masks_[slot].anchored & at.cells;
+      return true;
+    });
   }
-  std::sort(renewing_.begin(), renewing_.end());
-  for (const VoxelHandle voxel : renewing_) Replace<true, true>(voxel, PositionOf(voxel, grid_->CentroidInBlock(voxel)));
   for (const VoxelHandle voxel : update.activated)
     Replace<false, true>(voxel, PositionOf(voxel, grid_->CentroidInBlock(voxel)));
+}
+
+/// Renews the contributions that are overdue among all that may reach the voxel's accumulators: if there are any, its estimate is
+/// stale.
+void IncrementalNormals::RenewAround(VoxelHandle voxel) const {
+  if ((masks_[voxel / kCells].stale & CellBit(voxel)) == 0) return;
+  renewing_.clear();
+  grid_->ForEachStencilBlock(stencil_, voxel, [&](std::uint32_t slot, const NeighbourStencil::BlockVisit& at) {
+    for (std::uint64_t cells = masks_[slot].overdue & at.cells; cells != 0; cells &= cells - 1)
+      renewing_.push_back(slot * kCells + static_cast<VoxelHandle>(__builtin_ctzll(cells)));
+    return true;
+  });
+  for (const VoxelHandle overdue : renewing_) Renew(overdue);
+}
+
+void IncrementalNormals::Renew(VoxelHandle voxel) const {
+  masks_[voxel / kCells].overdue &= ~CellBit(voxel);
+  Replace<true, true>(voxel, PositionOf(voxel, grid_->CentroidInBlock(voxel)));
 }
 
 IncrementalNormals::Position IncrementalNormals::PositionOf(VoxelHandle voxel, const Eigen::Vector3f& in_block) const {
@@ -169,7 +201,7 @@ std::uint64_t IncrementalNormals::CellsWithinRadius(const Block& block, std::uin
 /// The voxel takes back what it gave as of its anchor (kWithdraw), and gives anew as of the position, its anchor from now on (kGive).
 /// Its own accumulators get the neighbours that it wins, and lose those that it leaves.
 template <bool kWithdraw, bool kGive>
-void IncrementalNormals::Replace(VoxelHandle voxel, const Position& position) {
+void IncrementalNormals::Replace(VoxelHandle voxel, const Position& position) const {
   const unsigned cell = voxel % kCells;
   const std::uint32_t home = voxel / kCells;
   Moments own = blocks_[home].moments[cell];
@@ -201,19 +233,26 @@ void IncrementalNormals::Replace(VoxelHandle voxel, const Position& position) {
   for (const ReachedBlock& reached : reached_) {
     Block& other = blocks_[reached.slot];
     const Position before_there = before - reached.corner, position_there = position - reached.corner;
-    for (std::uint64_t cells = reached.before; kWithdraw && cells != 0; cells &= cells - 1) {
+    const std::uint64_t both = reached.before & reached.after, lost = reached.before & ~both, won = reached.after & ~both;
+    const Position moved = position - before, sum_there = before_there + position_there;
+    for (std::uint64_t cells = both; kWithdraw && kGive && cells != 0; cells &= cells - 1) {
+      const unsigned neighbour = static_cast<unsigned>(__builtin_ctzll(cells));
+      const Position& there = cell_centers_[neighbour];
+      AccumulateMove(moved, sum_there - there - there, &other.moments[neighbour]);
+    }
+    for (std::uint64_t cells = lost; kWithdraw && cells != 0; cells &= cells - 1) {
       const unsigned neighbour = static_cast<unsigned>(__builtin_ctzll(cells));
       Accumulate<-1>(before_there - cell_centers_[neighbour], &other.moments[neighbour]);
     }
-    for (std::uint64_t cells = reached.after; kGive && cells != 0; cells &= cells - 1) {
+    for (std::uint64_t cells = won; kGive && cells != 0; cells &= cells - 1) {
       const unsigned neighbour = static_cast<unsigned>(__builtin_ctzll(cells));
       Accumulate<1>(position_there - cell_centers_[neighbour], &other.moments[neighbour]);
     }
     masks_[reached.slot].stale |= reached.before | reached.after;
     const Position from_there = reached.corner - center;
     const auto theirs = [&](std::uint64_t cells) { return other.Anchor(static_cast<unsigned>(__builtin_ctzll(cells))) + from_there; };
-    for (std::uint64_t won = reached.after & ~reached.before; kGive && won != 0; won &= won - 1) Accumulate<1>(theirs(won), &own);
-    for (std::uint64_t lost = reached.before & ~reached.after; kGive && lost != 0; lost &= lost - 1) Accumulate<-1>(theirs(lost), &own);
+    for (std::uint64_t cells = won; kGive && cells != 0; cells &= cells - 1) Accumulate<1>(theirs(cells), &own);
+    for (std::uint64_t cells = lost; kGive && cells != 0; cells &= cells - 1) Accumulate<-1>(theirs(cells), &own);
   }
 
   if (!kGive) return;
@@ -231,6 +270,7 @@ bool IncrementalNormals::IsAnchored(VoxelHandle voxel) const {
 
 const IncrementalNormals::Moments& IncrementalNormals::MomentsOf(VoxelHandle voxel) const {
   if (!IsAnchored(voxel)) throw std::invalid_argument("voxel " + std::to_string(voxel) + " has no normal: it is not active");
+  RenewAround(voxel);
   return blocks_[voxel / kCells].moments[voxel % kCells];
 }
 
@@ -290,6 +330,7 @@ NormalAccumulators IncrementalNormals::Accumulators(VoxelHandle voxel) const {
 
 Eigen::Vector3i IncrementalNormals::Anchor(VoxelHandle voxel) const {
   MomentsOf(voxel);  // throws if there is none
+  if ((masks_[voxel / kCells].overdue & CellBit(voxel)) != 0) Renew(voxel);
   return (blocks_[voxel / kCells].Anchor(voxel % kCells) - cell_centers_[voxel % kCells]).xyz1.head<3>().cast<int>();
 }
 

@@ -131,6 +131,7 @@ typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::Visit
   grid_->ForEachNeighbour(stencil_, from, [&](VoxelHandle to, const Eigen::Vector3f&) {
     const Label label = voxels_[to].label;
     if (label == kQueued) return true;
+    if (label != kNoLabel && root != kNoLabel && FindRoot(label) == root) return true;  // spares asking the policy
     if (!policy_.CanPointBeSeed(to)) {
       if (label == kNoLabel) rough_.push_back(to);  // looked at once all regions have grown
       return true;
@@ -138,7 +139,7 @@ typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::Visit
     if (!policy_.CanGrowToPoint(from, to)) return true;
     if (label == kNoLabel) {
       Queue(to);
-    } else if (label != root) {
+    } else {
       root = Meet(root, label);
     }
     return true;

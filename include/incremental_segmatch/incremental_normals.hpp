@@ -54,12 +54,14 @@ SmallestEigen SmallestEigenOf(const Eigen::Matrix3d& matrix);
 /// of up to 3.5 voxels) relative to their own cell, so that all sums are integers: accumulators equal the batch sums
 /// over the anchors bit for bit after any sequence of calls, in any order, anywhere in the world.
 ///
-/// Normals are computed when they are read, and kept until an accumulator changes. All is in the grid's frame: after
+/// Contributions are renewed when somebody reads accumulators that they may reach, and not before: most of what moves is
+/// read by nobody. Whoever reads finds all anchors around within the tolerance of their centroids. Normals are computed
+/// when they are read, and kept until an accumulator changes. All is in the grid's frame: after
 /// DynamicVoxelGrid::Transform the accumulators of (3.12), A <- R A RT + R b tT + t bT RT + n t tT and b <- n t + R b,
 /// and N <- R N are what one gets by expressing them in the new frame, and nothing need be done; NormalOdom rotates
 /// when it is read.
 ///
-/// Cost: Insert O((activated + renewed) * neighbours + moved), Remove O(removed * neighbours). Not thread-safe, not
+/// Cost: Insert O(activated * neighbours + moved), reading O(renewed * neighbours) more, Remove O(removed * neighbours). Not thread-safe, not
 /// even for reading. The grid must outlive this object.
 class IncrementalNormals {
  public:
@@ -115,13 +117,14 @@ class IncrementalNormals {
   struct Block {
     std::array<std::array<float, DynamicVoxelGrid::kCellsPerBlock>, 3> anchors;  // x, y, z: rows of four cells at a time
     std::array<Moments, DynamicVoxelGrid::kCellsPerBlock> moments;
-    mutable std::array<NormalEstimate, DynamicVoxelGrid::kCellsPerBlock> estimates;
+    std::array<NormalEstimate, DynamicVoxelGrid::kCellsPerBlock> estimates;
 
     Position Anchor(unsigned cell) const { return {anchors[0][cell], anchors[1][cell], anchors[2][cell]}; }
   };
   struct Masks {
     std::uint64_t anchored = 0;       // cells whose voxels have given their contribution
-    mutable std::uint64_t stale = 0;  // cells whose estimate is older than their accumulators
+    std::uint64_t overdue = 0;        // of them, cells whose contribution is to be renewed before it is read
+    std::uint64_t stale = 0;  // cells whose estimate is older than their accumulators
   };
   // A block around the voxel of Replace.
   struct ReachedBlock {
@@ -138,8 +141,14 @@ class IncrementalNormals {
   std::uint64_t CellsWithinRadius(const Block& block, std::uint64_t cells, const Position& position) const;
   template <int kSign>
   static void Accumulate(const Position& p, Moments* moments);
+  static void AccumulateMove(const Position& difference, const Position& sum, Moments* moments);
   template <bool kWithdraw, bool kGive>
-  void Replace(VoxelHandle voxel, const Position& position);
+  void Replace(VoxelHandle voxel, const Position& position) const;
+  void RenewAround(VoxelHandle voxel) const;
+  void Renew(VoxelHandle voxel) const;
+  static std::uint64_t CellBit(VoxelHandle voxel) {
+    return std::uint64_t{1} << (voxel % DynamicVoxelGrid::kCellsPerBlock);
+  }
   Eigen::Matrix3d CovarianceOf(const Moments& moments) const;
   NormalEstimate Compute(const Moments& moments) const;
 
@@ -152,10 +161,12 @@ class IncrementalNormals {
   std::array<Position, DynamicVoxelGrid::kCellsPerBlock> cell_centers_;  // relative to the block's corner; last lane 0
   float radius2_units_ = 0.f;
   float tolerance2_units_ = 0.f;
-  PagedArray<Block> blocks_;
-  std::vector<ReachedBlock> reached_;                   // work space of Replace
-  std::vector<VoxelHandle> renewing_, leaving_;  // work space of Insert and Remove
-  std::vector<Masks> masks_;  // apart from the blocks, since most blocks around a voxel have nothing in reach
+  // Mutable, since contributions are renewed when they are read.
+  mutable PagedArray<Block> blocks_;
+  mutable std::vector<Masks> masks_;           // apart from the blocks: most around a voxel have nothing in reach
+  mutable std::vector<ReachedBlock> reached_;  // work space of Replace
+  mutable std::vector<VoxelHandle> renewing_;  // work space of RenewAround
+  std::vector<VoxelHandle> leaving_;           // work space of Remove
 };
 
 }  // namespace incremental_segmatch
