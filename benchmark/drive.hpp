@@ -5,11 +5,11 @@
 #include <benchmark/benchmark.h>
 
 #include <algorithm>
-#include <chrono>
 #include <cstddef>
 #include <string>
 #include <vector>
 
+#include "incremental_segmatch/stage_times.hpp"
 #include "incremental_segmatch/types.hpp"
 
 namespace incremental_segmatch::bench {
@@ -55,12 +55,12 @@ class StepTimes {
   std::vector<double> milliseconds_;
 };
 
-/// Seconds that a call takes.
+/// Seconds of CPU time that a call takes, whatever else keeps the machine busy.
 template <class Call>
 double Seconds(Call&& call) {
-  const auto start = std::chrono::steady_clock::now();
+  const double start_ms = ThreadCpuMs();
   call();
-  return std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
+  return 1e-3 * (ThreadCpuMs() - start_ms);
 }
 
 /// Drives through the setup's scans with a local map that has `Step(const DriveScan&)`, which returns the seconds that count. One
