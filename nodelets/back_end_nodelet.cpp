@@ -7,6 +7,7 @@
 #include <boost/make_shared.hpp>
 #include <exception>
 #include <pluginlib/class_list_macros.hpp>
+#include <set>
 #include <utility>
 
 #include "markers.hpp"
@@ -16,9 +17,14 @@ namespace {
 
 constexpr double kWarnPeriod_s = 5.0;
 constexpr double kRequestPeriod_s = 1.0;
+constexpr double kMemoryPeriod_s = 2.0;
+constexpr double kLabelRadius_m = 40.0;  // around the robot
+constexpr double kLetter_m = 0.7;
+constexpr double kResidualExaggeration = 10.0;
 
-const LineStyle kCandidateStyle{"candidates", 0.7f, 0.7f, 0.75f, 0.07f, 0.05};
+const LineStyle kRefusedStyle{"refused", 0.7f, 0.7f, 0.75f, 0.07f, 0.05};
 const LineStyle kAcceptedStyle{"accepted", 0.1f, 0.9f, 0.2f, 1.0f, 0.2};
+const LineStyle kResidualStyle{"residuals", 1.0f, 0.2f, 0.2f, 1.0f, 0.15};
 const LineStyle kClosureStyle{"closures", 1.0f, 0.85f, 0.1f, 1.0f, 0.25};
 
 /// Index in the map of a robot of this run: the last of that name, since those of a loaded map come first.
@@ -26,6 +32,17 @@ std::optional<RobotIndex> FindRobot(const TargetMap& map, const std::string& nam
   for (std::size_t i = map.robots(); i-- > 0;)
     if (map.RobotName(static_cast<RobotIndex>(i)) == name) return static_cast<RobotIndex>(i);
   return std::nullopt;
+}
+
+/// The candidates that are none of the accepted matches.
+std::vector<SegmentMatch> RefusedMatches(const BackEndStep& step) {
+  if (!step.closure) return step.candidates;
+  std::set<std::pair<SegmentKey, SegmentKey>> accepted;
+  for (const SegmentMatch& match : step.closure->matches) accepted.insert({match.local, match.target});
+  std::vector<SegmentMatch> refused;
+  for (const SegmentMatch& match : step.candidates)
+    if (accepted.count({match.local, match.target}) == 0) refused.push_back(match);
+  return refused;
 }
 
 /// Where a robot was at a stamp of its trajectory, in the map.
@@ -46,7 +63,10 @@ BackEndNodelet::~BackEndNodelet() {
   for (ros::Subscriber& subscriber : subscribers_) subscriber.shutdown();
   save_service_.shutdown();
   load_service_.shutdown();
+  reset_service_.shutdown();
+  trigger_service_.shutdown();
   diagnostics_timer_.stop();
+  tuning_.reset();
   worker_.reset();
 }
 
@@ -66,8 +86,11 @@ void BackEndNodelet::Start() {
 
   closures_publisher_ = nh.advertise<LoopClosure>("loop_closures", 100);
   targets_publisher_ = nh.advertise<sensor_msgs::PointCloud2>("target_segments", 1);
-  candidates_publisher_ = nh.advertise<visualization_msgs::Marker>("candidate_matches", 1);
+  labels_publisher_ = nh.advertise<visualization_msgs::MarkerArray>("target_labels", 1);
+  refused_publisher_ = nh.advertise<visualization_msgs::Marker>("refused_matches", 1);
   accepted_publisher_ = nh.advertise<visualization_msgs::Marker>("accepted_matches", 1);
+  residuals_publisher_ = nh.advertise<visualization_msgs::Marker>("residuals", 1);
+  selected_publisher_ = nh.advertise<visualization_msgs::MarkerArray>("selected_segment", 1, true);
   closure_lines_publisher_ = nh.advertise<visualization_msgs::Marker>("closure_lines", 1, true);
   steps_publisher_ = nh.advertise<StepReport>("back_end_steps", 10);
   if (IsLocalization()) {
@@ -86,8 +109,16 @@ void BackEndNodelet::Start() {
   });
   save_service_ = nh.advertiseService("save_map", &BackEndNodelet::OnSaveMap, this);
   load_service_ = nh.advertiseService("load_map", &BackEndNodelet::OnLoadMap, this);
+  reset_service_ = nh.advertiseService("reset", &BackEndNodelet::OnReset, this);
+  trigger_service_ = nh.advertiseService("trigger", &BackEndNodelet::OnTrigger, this);
   if (parameters_.robots.empty()) Subscribe("");
   for (const std::string& robot : parameters_.robots) Subscribe(robot);
+  const boost::function<void(const geometry_msgs::PointStampedConstPtr&)> on_point =
+      [this](const geometry_msgs::PointStampedConstPtr& m) { worker_->PostAlways([this, m] { Select(*m); }); };
+  subscribers_.push_back(nh.subscribe<geometry_msgs::PointStamped>("clicked_point", 1, on_point));
+  tuning_ = std::make_unique<Tuning<BackEndConfig>>(
+      getPrivateNodeHandle(), ToConfig(parameters),
+      [this](const BackEndConfig& config) { worker_->Run([this, &config] { Change(config); }); });
 
   diagnostics_ = std::make_unique<diagnostic_updater::Updater>(nh, getPrivateNodeHandle(), getName());
   diagnostics_->setHardwareID("none");
@@ -100,6 +131,7 @@ void BackEndNodelet::Subscribe(const std::string& robot) {
   ros::NodeHandle& nh = getNodeHandle();
   const std::string prefix = robot.empty() ? "" : robot + "/";
   const std::string topic = nh.resolveName(prefix + "segments");
+  segments_topics_.push_back(topic);
   const boost::function<void(const SegmentArrayConstPtr&)> on_segments = [this, topic](const SegmentArrayConstPtr& m) {
     {
       const std::lock_guard<std::mutex> lock(mutex_);
@@ -125,6 +157,7 @@ void BackEndNodelet::StartOver() {
   }
   robots_.clear();
   closures_.clear();
+  selected_.reset();
   if (!parameters_.output_dir.empty())
     closure_log_ = std::make_unique<ClosureLog>(parameters_.output_dir + "/closures.csv");
 }
@@ -151,6 +184,7 @@ bool BackEndNodelet::OnLoadMap(LoadMap::Request& request, LoadMap::Response& res
       back_end_ = std::make_unique<BackEnd>(core_parameters_, TargetMap::Load(path, core_parameters_.target_map));
       robots_.clear();
       closures_.clear();
+      selected_.reset();
       return static_cast<std::uint32_t>(back_end_->map().segments().size());
     });
     response.success = true;
@@ -162,10 +196,94 @@ bool BackEndNodelet::OnLoadMap(LoadMap::Request& request, LoadMap::Response& res
   return true;
 }
 
+bool BackEndNodelet::OnReset(std_srvs::Trigger::Request& /*request*/, std_srvs::Trigger::Response& response) {
+  try {
+    response.message = worker_->Run([this] { return Reset(); });
+    response.success = true;
+  } catch (const std::exception& error) {
+    response.success = false;
+    response.message = error.what();
+  }
+  return true;
+}
+
+/// Everybody forgets everything: the front ends first, so that nothing of before comes after.
+std::string BackEndNodelet::Reset() {
+  std::string unreached;
+  for (const std::string& topic : segments_topics_) {
+    std_srvs::Trigger front_end;
+    if (!ros::service::exists(topic + "/reset", false) || !ros::service::call(topic + "/reset", front_end))
+      unreached += (unreached.empty() ? "" : ", ") + topic;
+  }
+  if (unreached.empty()) {
+    sessions_.EndAll();
+    const std::string pose_graph = getNodeHandle().resolveName("reset_pose_graph");
+    std_srvs::Trigger graph;
+    if (ros::service::exists(pose_graph, false)) ros::service::call(pose_graph, graph);
+  } else {
+    sessions_.Clear();
+  }
+  StartOver();
+  const std::string map = std::to_string(back_end_->map().segments().size()) + " segments in the map";
+  if (unreached.empty()) return "map, front ends and pose graph start over; " + map;
+  return "the map starts over; no front end answers for " + unreached +
+         ", so local map and pose graph stay as they are; " + map;
+}
+
+bool BackEndNodelet::OnTrigger(std_srvs::Trigger::Request& /*request*/, std_srvs::Trigger::Response& response) {
+  try {
+    bool recognized = false;
+    response.message = worker_->Run([this, &recognized] { return RecognizeAgain(&recognized); });
+    response.success = recognized;
+  } catch (const std::exception& error) {
+    response.success = false;
+    response.message = error.what();
+  }
+  return true;
+}
+
+/// Attempts a recognition for every robot that tracks segments, and publishes it, however recent the last one is. In
+/// words, what came of it.
+std::string BackEndNodelet::RecognizeAgain(bool* recognized) {
+  if (!back_end_) throw std::runtime_error("the back end has not started");
+  if (robots_.empty()) throw std::runtime_error("no segments have come from any robot yet");
+  std::string words;
+  for (auto& [session, robot] : robots_) {
+    const BackEndStep step = back_end_->RecognizeAgain(session);
+    robot.published_path_m.reset();
+    Publish(step, session, robot);
+    words += (words.empty() ? "" : "; ") + session + ": " + ToString(step.counts.end) + ", " +
+             std::to_string(step.counts.local_segments) + " local segments, " + std::to_string(step.counts.candidates) +
+             " candidate matches of " + std::to_string(step.counts.allowed_targets) +
+             " allowed targets, largest consistent set " + std::to_string(step.counts.clique) + " of at least " +
+             std::to_string(core_parameters_.recognizer.clique.min_size);
+    *recognized = *recognized || step.closure.has_value();
+  }
+  return words;
+}
+
+/// Throws std::invalid_argument, naming the parameter, if it is refused: nothing has changed then.
+void BackEndNodelet::Change(const BackEndConfig& config) {
+  NodeletParameters<BackEndNodeParameters> parameters{parameters_, Parameters()};
+  parameters.core.back_end = core_parameters_;
+  try {
+    if (!back_end_) throw std::invalid_argument("the back end has not started");
+    parameters = WithConfig(std::move(parameters), config);
+    back_end_->ChangeParameters(parameters.core.back_end);
+  } catch (const std::invalid_argument& error) {
+    NODELET_WARN("a change of the parameters is refused: %s", error.what());
+    throw;
+  }
+  core_parameters_ = parameters.core.back_end;
+  parameters_ = parameters.node;
+  NODELET_INFO("the parameters have changed");
+}
+
 void BackEndNodelet::ProcessSegments(const SegmentArray& message, const std::string& topic) {
   if (!back_end_) return;
   const RobotSessions::Session session =
       sessions_.Find(message.robot, message.session, ToStampNs(message.header.stamp));
+  if (session.change == RobotSessions::Change::kEnded) return;
   if (session.change == RobotSessions::Change::kRewound) {
     NODELET_WARN("time jumped back for %s: the back end forgets all robots and starts over", message.robot.c_str());
     sessions_.Clear();
@@ -175,7 +293,7 @@ void BackEndNodelet::ProcessSegments(const SegmentArray& message, const std::str
   if (session.change == RobotSessions::Change::kRestarted)
     NODELET_WARN("the front end of %s has started over: it goes on as %s", message.robot.c_str(), session.name.c_str());
 
-  Robot& robot = Meet(session, message);
+  Robot& robot = Meet(session.name, message);
   const SegmentDelta delta = ToSegmentDelta(message, session.name);
   const BackEndStep step = back_end_->Process(delta);
   if (step.missed_delta) {
@@ -185,18 +303,21 @@ void BackEndNodelet::ProcessSegments(const SegmentArray& message, const std::str
     }
     return RequestFullState(topic);
   }
-  Publish(step, delta, robot);
+  Publish(step, session.name, robot);
   Report(step);
 }
 
-BackEndNodelet::Robot& BackEndNodelet::Meet(const RobotSessions::Session& session, const SegmentArray& message) {
-  const auto [it, is_new] = robots_.try_emplace(session.name);
+BackEndNodelet::Robot& BackEndNodelet::Meet(const std::string& session, const SegmentArray& message) {
+  const auto [it, is_new] = robots_.try_emplace(session);
   Robot& robot = it->second;
-  const Eigen::Vector3d position = ToVector(message.sensor_pose.position);
-  if (!is_new) robot.path_m += (position - robot.position_odom).norm();
+  const Pose T_continuous_sensor = ContinuousSensorPose(message);
+  const Pose last_T_continuous_sensor = robot.T_odom_continuous.inverse() * robot.T_odom_sensor;
+  if (!is_new) robot.path_m += (T_continuous_sensor.translation() - last_T_continuous_sensor.translation()).norm();
   robot.name = message.robot;
   robot.frames = ToRobotFrames(message);
-  robot.position_odom = position;
+  robot.stamp_ns = ToStampNs(message.header.stamp);
+  robot.T_odom_sensor = ToPose(message.sensor_pose, "sensor_pose");
+  robot.T_odom_continuous = ToPose(message.continuous_frame, "continuous_frame");
   return robot;
 }
 
@@ -233,27 +354,27 @@ void BackEndNodelet::CorrectTrajectory(const std::string& robot_name, const nav_
   }
 }
 
-void BackEndNodelet::Publish(const BackEndStep& step, const SegmentDelta& delta, Robot& robot) {
+void BackEndNodelet::Publish(const BackEndStep& step, const std::string& session, Robot& robot) {
   if (step.closure) {
     const Closure& closure = *step.closure;
-    robot.T_map_odom = closure.T_map_odom;
+    robot.T_map_continuous = closure.T_map_odom * robot.T_odom_continuous;
     closures_.push_back({closure.robot_query, closure.stamp_query_ns, closure.robot_target, closure.stamp_target_ns});
     if (closure_log_) closure_log_->Add(closure);
     if (IsLocalization()) {
-      PublishLocalization(closure, delta, robot);
+      PublishLocalization(closure, robot);
     } else if (IsDue(closure, robot)) {
       PublishClosure(closure, robot);
     }
   }
-  PublishTransform(delta, robot);
-  PublishMatches(step, delta, robot);
-  PublishMap(ToTime(delta.stamp_ns));
+  PublishTransform(robot);
+  PublishMatches(step, session, robot);
+  PublishMap(session, robot);
   if (steps_publisher_.getNumSubscribers() > 0) {
     std_msgs::Header header;
-    header.stamp = ToTime(delta.stamp_ns);
+    header.stamp = ToTime(robot.stamp_ns);
     header.frame_id = robot.frames.odom_frame;
     steps_publisher_.publish(
-        ToStepReport(header, delta.robot, step.times, ToNamedCounts(step.counts), ToString(step.counts.end)));
+        ToStepReport(header, session, step.times, ToNamedCounts(step.counts), ToString(step.counts.end)));
   }
 }
 
@@ -284,70 +405,107 @@ void BackEndNodelet::PublishClosure(const Closure& closure, Robot& robot) {
   ++status_.published;
 }
 
-void BackEndNodelet::PublishLocalization(const Closure& closure, const SegmentDelta& delta, const Robot& robot) {
+void BackEndNodelet::PublishLocalization(const Closure& closure, const Robot& robot) {
   const Pose T_sensor_base = robot.frames.T_base_sensor.inverse();
-  const Pose T_map_base = closure.T_map_odom * delta.T_odom_sensor * T_sensor_base;
+  const Pose T_map_base = closure.T_map_odom * robot.T_odom_sensor * T_sensor_base;
   const Covariance6 covariance = MoveRightPerturbation(closure.covariance, T_sensor_base);
   geometry_msgs::PoseWithCovarianceStamped message;
-  message.header.stamp = ToTime(delta.stamp_ns);
-  message.header.frame_id = parameters_.map_frame;
+  message.header = MapHeader(robot.stamp_ns);
   message.pose = ToPoseWithCovariance(T_map_base, RightPerturbationToParentAxes(covariance, T_map_base));
   localization_publisher_.publish(message);
 }
 
-void BackEndNodelet::PublishTransform(const SegmentDelta& delta, const Robot& robot) {
-  if (!tf_broadcaster_ || !robot.T_map_odom) return;
-  const ros::Time stamp = ToTime(delta.stamp_ns) + ros::Duration(parameters_.tf_tolerance_s);
-  tf_broadcaster_->sendTransform(ToTransform(*robot.T_map_odom, parameters_.map_frame, robot.frames.odom_frame, stamp));
+void BackEndNodelet::PublishTransform(const Robot& robot) {
+  if (!tf_broadcaster_ || !robot.T_map_continuous) return;
+  const ros::Time stamp = ToTime(robot.stamp_ns) + ros::Duration(parameters_.tf_tolerance_s);
+  const Pose T_map_odom = *robot.T_map_continuous * robot.T_odom_continuous.inverse();
+  tf_broadcaster_->sendTransform(ToTransform(T_map_odom, parameters_.map_frame, robot.frames.odom_frame, stamp));
 }
 
-void BackEndNodelet::PublishMatches(const BackEndStep& step, const SegmentDelta& delta, const Robot& robot) {
-  std_msgs::Header header;
-  header.stamp = ToTime(delta.stamp_ns);
-  header.frame_id = parameters_.map_frame;
-  const Pose T_map_odom = MapOdom(delta.robot, robot);
-  if (candidates_publisher_.getNumSubscribers() > 0)
-    candidates_publisher_.publish(
-        LineMarker(MatchLines(step.candidates, T_map_odom, parameters_.display_height_m), kCandidateStyle, header));
-  if (accepted_publisher_.getNumSubscribers() > 0) {
-    const std::vector<SegmentMatch> matches = step.closure ? step.closure->matches : std::vector<SegmentMatch>();
-    accepted_publisher_.publish(
-        LineMarker(MatchLines(matches, T_map_odom, parameters_.display_height_m), kAcceptedStyle, header));
-  }
+void BackEndNodelet::PublishMatches(const BackEndStep& step, const std::string& session, const Robot& robot) {
+  const std_msgs::Header header = MapHeader(robot.stamp_ns);
+  const double height_m = parameters_.display_height_m;
+  const Pose T_map_odom = MapOdom(session, robot);
+  const std::vector<SegmentMatch> accepted = step.closure ? step.closure->matches : std::vector<SegmentMatch>();
+  if (refused_publisher_.getNumSubscribers() > 0)
+    refused_publisher_.publish(
+        LineMarker(MatchLines(RefusedMatches(step), T_map_odom, height_m), kRefusedStyle, header));
+  if (accepted_publisher_.getNumSubscribers() > 0)
+    accepted_publisher_.publish(LineMarker(MatchLines(accepted, T_map_odom, height_m), kAcceptedStyle, header));
+  if (step.closure && residuals_publisher_.getNumSubscribers() > 0)
+    residuals_publisher_.publish(LineMarker(
+        ResidualLines(accepted, step.closure->T_map_odom, height_m, kResidualExaggeration), kResidualStyle, header));
 }
 
-void BackEndNodelet::PublishMap(const ros::Time& stamp) {
-  std_msgs::Header header;
-  header.stamp = stamp;
-  header.frame_id = parameters_.map_frame;
-  if (targets_publisher_.getNumSubscribers() > 0 && throttle_.IsDue("targets", parameters_.display_period_s))
-    targets_publisher_.publish(TargetCloud(back_end_->map(), parameters_.display_height_m, header));
-  if (closure_lines_publisher_.getNumSubscribers() > 0 && throttle_.IsDue("closures", parameters_.display_period_s)) {
-    std::vector<Line> lines;
-    for (const ClosureEnds& ends : closures_) {
-      const auto query = PositionAt(back_end_->map(), ends.robot_query, ends.stamp_query_ns);
-      const auto target = PositionAt(back_end_->map(), ends.robot_target, ends.stamp_target_ns);
-      if (query && target) lines.emplace_back(*query, *target);
-    }
-    closure_lines_publisher_.publish(LineMarker(lines, kClosureStyle, header));
+void BackEndNodelet::PublishMap(const std::string& session, const Robot& robot) {
+  const std_msgs::Header header = MapHeader(robot.stamp_ns);
+  const double height_m = parameters_.display_height_m;
+  const double period_s = parameters_.display_period_s;
+  if (targets_publisher_.getNumSubscribers() > 0 && throttle_.IsDue("targets", period_s))
+    targets_publisher_.publish(TargetCloud(back_end_->map(), height_m, header));
+  if (labels_publisher_.getNumSubscribers() > 0 && throttle_.IsDue("labels", period_s)) {
+    const Eigen::Vector3d place = MapOdom(session, robot) * robot.T_odom_sensor.translation();
+    labels_publisher_.publish(
+        LabelMarkers(TargetLabels(back_end_->map(), place, kLabelRadius_m, height_m), "targets", kLetter_m, header));
   }
+  if (closure_lines_publisher_.getNumSubscribers() > 0 && throttle_.IsDue("closures", period_s))
+    PublishClosureLines(header);
+  if (selected_ && throttle_.IsDue("selected", period_s)) PublishSelected();
+}
+
+void BackEndNodelet::PublishClosureLines(const std_msgs::Header& header) {
+  std::vector<Line> lines;
+  for (const ClosureEnds& ends : closures_) {
+    const auto query = PositionAt(back_end_->map(), ends.robot_query, ends.stamp_query_ns);
+    const auto target = PositionAt(back_end_->map(), ends.robot_target, ends.stamp_target_ns);
+    if (query && target) lines.emplace_back(*query, *target);
+  }
+  closure_lines_publisher_.publish(LineMarker(lines, kClosureStyle, header));
+}
+
+/// Shows the history of the segment that is nearest to a point in the map.
+void BackEndNodelet::Select(const geometry_msgs::PointStamped& point) {
+  if (!back_end_) return;
+  if (point.header.frame_id != parameters_.map_frame) {
+    NODELET_WARN("the clicked point is in frame %s: make %s rviz's fixed frame to select segments",
+                 point.header.frame_id.c_str(), parameters_.map_frame.c_str());
+    return;
+  }
+  selected_ = NearestTarget(back_end_->map(), ToVector(point.point), parameters_.display_height_m);
+  if (selected_) PublishSelected();
+}
+
+void BackEndNodelet::PublishSelected() {
+  if (selected_publisher_.getNumSubscribers() == 0) return;
+  std_msgs::Header header;  // stamp 0: rviz takes the newest transform
+  header.frame_id = parameters_.map_frame;
+  selected_publisher_.publish(HistoryMarkers(back_end_->map(), *selected_, parameters_.display_height_m, header));
+}
+
+std_msgs::Header BackEndNodelet::MapHeader(StampNs stamp_ns) const {
+  std_msgs::Header header;
+  header.stamp = ToTime(stamp_ns);
+  header.frame_id = parameters_.map_frame;
+  return header;
 }
 
 Pose BackEndNodelet::MapOdom(const std::string& session, const Robot& robot) const {
-  if (IsLocalization()) return robot.T_map_odom.value_or(Pose::Identity());
+  const Pose T_continuous_odom = robot.T_odom_continuous.inverse();
+  if (IsLocalization()) return robot.T_map_continuous.value_or(Pose::Identity()) * T_continuous_odom;
   const std::optional<RobotIndex> index = FindRobot(back_end_->map(), session);
-  return index ? back_end_->map().T_map_odom(*index) : Pose::Identity();
+  return (index ? back_end_->map().T_map_odom(*index) : Pose::Identity()) * T_continuous_odom;
 }
 
 void BackEndNodelet::Report(const BackEndStep& step) {
-  const std::size_t memory_bytes = back_end_->memory_bytes();
+  const bool measure = throttle_.IsDue("memory", kMemoryPeriod_s);  // goes through the whole map
+  const std::size_t memory_bytes = measure ? back_end_->memory_bytes() : 0;
   const std::lock_guard<std::mutex> lock(mutex_);
   ++status_.processed;
   if (step.closure) ++status_.recognitions;
   ++status_.ends[ToString(step.counts.end)];
   status_.counts = step.counts;
   status_.times = step.times;
-  status_.memory_bytes = memory_bytes;
+  if (measure) status_.memory_bytes = memory_bytes;
 }
 
 void BackEndNodelet::Refuse(const std::string& what) {

@@ -3,11 +3,13 @@
 #pragma once
 
 #include <diagnostic_updater/diagnostic_updater.h>
+#include <geometry_msgs/PointStamped.h>
 #include <incremental_segmatch/LoadMap.h>
 #include <incremental_segmatch/SaveMap.h>
 #include <nav_msgs/Path.h>
 #include <nodelet/nodelet.h>
 #include <ros/ros.h>
+#include <std_srvs/Trigger.h>
 #include <tf2_ros/transform_broadcaster.h>
 
 #include <chrono>
@@ -24,6 +26,7 @@
 #include "node_parameters.hpp"
 #include "robot_sessions.hpp"
 #include "throttle.hpp"
+#include "tuning.hpp"
 #include "worker.hpp"
 
 namespace incremental_segmatch {
@@ -32,9 +35,10 @@ namespace incremental_segmatch {
 /// missing makes it ask the robot's front end for a full state. A wrong parameter is FATAL, and the nodelet then stays
 /// idle.
 ///
-/// Subscribes `segments` and `trajectory`, or `<robot>/segments` and `<robot>/trajectory`. Publishes `loop_closures`;
-/// `localization` and tf (in localization); `target_segments`, `candidate_matches`, `accepted_matches`, `closure_lines`
-/// for rviz; `back_end_steps`; diagnostics. Serves `save_map`, `load_map`.
+/// Subscribes `segments` and `trajectory`, or `<robot>/segments` and `<robot>/trajectory`; `clicked_point`. Publishes
+/// `loop_closures`; `localization` and tf (in localization); for rviz `target_segments`, `target_labels`,
+/// `refused_matches`, `accepted_matches`, `residuals`, `closure_lines`, `selected_segment`; `back_end_steps`;
+/// diagnostics. Serves `save_map`, `load_map`, `reset`, `trigger`, and dynamic_reconfigure below `~tuning`.
 class BackEndNodelet : public nodelet::Nodelet {
  public:
   ~BackEndNodelet() override;
@@ -46,8 +50,10 @@ class BackEndNodelet : public nodelet::Nodelet {
   struct Robot {
     std::string name;  ///< of the robot; the session's own name is the key
     RobotFrames frames;
-    std::optional<Pose> T_map_odom;  ///< of the last recognition
-    Eigen::Vector3d position_odom = Eigen::Vector3d::Zero();
+    StampNs stamp_ns = 0;  ///< of the last delta, as the next two
+    Pose T_odom_sensor = Pose::Identity();
+    Pose T_odom_continuous = Pose::Identity();  ///< jumps of odometry
+    std::optional<Pose> T_map_continuous;       ///< of the last recognition
     double path_m = 0.0;
     std::optional<double> published_path_m;  ///< at the last published closure
     StampNs published_ns = 0;
@@ -85,43 +91,59 @@ class BackEndNodelet : public nodelet::Nodelet {
   void Subscribe(const std::string& robot);
   bool OnSaveMap(SaveMap::Request& request, SaveMap::Response& response);
   bool OnLoadMap(LoadMap::Request& request, LoadMap::Response& response);
+  bool OnReset(std_srvs::Trigger::Request& request, std_srvs::Trigger::Response& response);
+  bool OnTrigger(std_srvs::Trigger::Request& request, std_srvs::Trigger::Response& response);
   void Diagnose(diagnostic_updater::DiagnosticStatusWrapper& status);
 
   // In the worker's thread.
   void StartOver();
+  std::string Reset();
+  std::string RecognizeAgain(bool* recognized);
+  void Change(const BackEndConfig& config);
   void ProcessSegments(const SegmentArray& message, const std::string& topic);
-  Robot& Meet(const RobotSessions::Session& session, const SegmentArray& message);
+  Robot& Meet(const std::string& session, const SegmentArray& message);
   void RequestFullState(const std::string& topic);
   void CorrectTrajectory(const std::string& robot, const nav_msgs::Path& path);
-  void Publish(const BackEndStep& step, const SegmentDelta& delta, Robot& robot);
+  void Publish(const BackEndStep& step, const std::string& session, Robot& robot);
   bool IsDue(const Closure& closure, const Robot& robot) const;
   void PublishClosure(const Closure& closure, Robot& robot);
-  void PublishLocalization(const Closure& closure, const SegmentDelta& delta, const Robot& robot);
-  void PublishTransform(const SegmentDelta& delta, const Robot& robot);
-  void PublishMatches(const BackEndStep& step, const SegmentDelta& delta, const Robot& robot);
-  void PublishMap(const ros::Time& stamp);
+  void PublishLocalization(const Closure& closure, const Robot& robot);
+  void PublishTransform(const Robot& robot);
+  void PublishMatches(const BackEndStep& step, const std::string& session, const Robot& robot);
+  void PublishMap(const std::string& session, const Robot& robot);
+  void PublishClosureLines(const std_msgs::Header& header);
+  void Select(const geometry_msgs::PointStamped& point);
+  void PublishSelected();
+  std_msgs::Header MapHeader(StampNs stamp_ns) const;
   Pose MapOdom(const std::string& session, const Robot& robot) const;
   void Report(const BackEndStep& step);
   void Refuse(const std::string& what);
   bool IsLocalization() const { return core_parameters_.mode == Mode::kLocalization; }
 
-  BackEndNodeParameters parameters_;
-  BackEndParameters core_parameters_;
+  BackEndNodeParameters parameters_;   // what may change, the worker's thread changes
+  BackEndParameters core_parameters_;  // likewise
   Throttle throttle_;
 
   std::vector<ros::Subscriber> subscribers_;
+  std::vector<std::string> segments_topics_;
   ros::Publisher closures_publisher_;
   ros::Publisher localization_publisher_;
   ros::Publisher targets_publisher_;
-  ros::Publisher candidates_publisher_;
+  ros::Publisher labels_publisher_;
+  ros::Publisher refused_publisher_;
   ros::Publisher accepted_publisher_;
+  ros::Publisher residuals_publisher_;
+  ros::Publisher selected_publisher_;
   ros::Publisher closure_lines_publisher_;
   ros::Publisher steps_publisher_;
   ros::ServiceServer save_service_;
   ros::ServiceServer load_service_;
+  ros::ServiceServer reset_service_;
+  ros::ServiceServer trigger_service_;
   ros::WallTimer diagnostics_timer_;
   std::unique_ptr<diagnostic_updater::Updater> diagnostics_;
   std::unique_ptr<tf2_ros::TransformBroadcaster> tf_broadcaster_;
+  std::unique_ptr<Tuning<BackEndConfig>> tuning_;
 
   std::mutex mutex_;
   Status status_;
@@ -132,6 +154,7 @@ class BackEndNodelet : public nodelet::Nodelet {
   RobotSessions sessions_;
   std::map<std::string, Robot> robots_;  // by session
   std::vector<ClosureEnds> closures_;
+  std::optional<SegmentKey> selected_;
 
   std::unique_ptr<Worker> worker_;  // last: its thread ends before anything else goes
 };

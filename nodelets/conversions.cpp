@@ -219,6 +219,7 @@ SegmentArray ToSegmentArray(const SegmentDelta& delta, const RobotFrames& frames
   message.full_state = delta.full_state;
   message.sensor_frame = frames.sensor_frame;
   message.sensor_pose = ToPoseMsg(delta.T_odom_sensor);
+  message.continuous_frame = ToPoseMsg(delta.T_odom_continuous);
   message.base_frame = frames.base_frame;
   message.sensor_in_base = ToPoseMsg(frames.T_base_sensor);
   message.changed.reserve(delta.changed.size());
@@ -243,6 +244,7 @@ SegmentDelta ToSegmentDelta(const SegmentArray& message, const std::string& robo
   delta.sequence = message.sequence;
   delta.stamp_ns = ToStampNs(message.header.stamp);
   delta.T_odom_sensor = ToPose(message.sensor_pose, "sensor_pose");
+  delta.T_odom_continuous = ToPose(message.continuous_frame, "continuous_frame");
   delta.full_state = message.full_state;
   delta.changed.reserve(message.changed.size());
   for (const Segment& segment : message.changed) {
@@ -253,6 +255,10 @@ SegmentDelta ToSegmentDelta(const SegmentArray& message, const std::string& robo
   for (const SegmentRenaming& renamed : message.renamed) delta.renamed.push_back({renamed.from_id, renamed.to_id});
   for (const SegmentRetirement& retired : message.retired) delta.retired.push_back({retired.id, FromCause(retired)});
   return delta;
+}
+
+Pose ContinuousSensorPose(const SegmentArray& message) {
+  return ToPose(message.continuous_frame, "continuous_frame").inverse() * ToPose(message.sensor_pose, "sensor_pose");
 }
 
 RobotFrames ToRobotFrames(const SegmentArray& message) {

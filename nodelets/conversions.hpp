@@ -69,6 +69,9 @@ SegmentArray ToSegmentArray(const SegmentDelta& delta, const RobotFrames& frames
 /// A message as a delta, under the given name of the robot. O(message).
 SegmentDelta ToSegmentDelta(const SegmentArray& message, const std::string& robot);
 
+/// Pose of the sensor in the frame that odometry would be without its jumps: what a graph of odometry edges needs.
+Pose ContinuousSensorPose(const SegmentArray& message);
+
 /// Frames of the robot that sent a message.
 RobotFrames ToRobotFrames(const SegmentArray& message);
 

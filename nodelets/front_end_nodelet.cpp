@@ -8,6 +8,7 @@
 #include <exception>
 #include <utility>
 
+#include "markers.hpp"
 #include "point_cloud.hpp"
 
 namespace incremental_segmatch {
@@ -15,9 +16,15 @@ namespace {
 
 constexpr double kPollPeriod_s = 0.005;
 constexpr double kWarnPeriod_s = 5.0;
+constexpr double kMissingPeriod_s = 10.0;       // between reminders that nothing comes
+constexpr double kStalePeriod_s = 60.0;         // between warnings that stamps and ROS time are far apart
+constexpr double kStale_s = 10.0;               // how far that is
 constexpr StampNs kJumpBackNs = 1'000'000'000;  // stamps that go back by less are late messages, by more a new run
 constexpr StampNs kSameStampNs = 1'000'000;     // stacks pass stamps through doubles
+constexpr std::uint32_t kCallbackQueue = 1000;  // roscpp drops without counting, so the worker's queue is to do it
 constexpr std::size_t kHistorySize = 600;
+constexpr double kLabelHeight_m = 0.5;           // over a segment's top
+constexpr double kLetter_m = 0.7;                // height of labels
 constexpr double kQuantisation = 0.1;            // of segment points, in voxels
 constexpr double kCoarseFloatDistance_m = 10e3;  // from here on, registered float clouds are coarser than a millimetre
 
@@ -25,15 +32,31 @@ bool HasFinitePoint(const Points& points) {
   return std::any_of(points.begin(), points.end(), [](const Eigen::Vector3f& p) { return p.allFinite(); });
 }
 
+/// Topics on which others publish clouds now, as words.
+std::string CloudTopics() {
+  ros::master::V_TopicInfo topics;
+  if (!ros::master::getTopics(topics)) return "the master does not answer";
+  ros::V_string own;
+  ros::this_node::getAdvertisedTopics(own);
+  std::string list;
+  for (const ros::master::TopicInfo& topic : topics)
+    if (std::find(own.begin(), own.end(), topic.name) == own.end() &&
+        topic.datatype == ros::message_traits::datatype<sensor_msgs::PointCloud2>())
+      list += (list.empty() ? "" : ", ") + topic.name;
+  return list.empty() ? "no PointCloud2 is published at all" : "PointCloud2 is published on: " + list;
+}
+
 }  // namespace
 
 FrontEndNodelet::~FrontEndNodelet() {
   // First, so that no callback runs any more when the worker goes.
   cloud_subscriber_.shutdown();
-  odometry_subscriber_.shutdown();
+  pose_subscriber_.shutdown();
   trajectory_subscriber_.shutdown();
   full_state_service_.shutdown();
+  reset_service_.shutdown();
   diagnostics_timer_.stop();
+  tuning_.reset();
   worker_.reset();
 }
 
@@ -58,31 +81,48 @@ void FrontEndNodelet::Start() {
 
   segments_publisher_ = nh.advertise<SegmentArray>("segments", 10);
   local_cloud_publisher_ = nh.advertise<sensor_msgs::PointCloud2>("local_cloud", 1);
+  labels_publisher_ = nh.advertise<visualization_msgs::MarkerArray>("local_labels", 1);
   steps_publisher_ = nh.advertise<StepReport>("front_end_steps", 10);
   full_state_service_ = nh.advertiseService(segments_publisher_.getTopic() + "/request_full_state",
                                             &FrontEndNodelet::OnRequestFullState, this);
+  reset_service_ = nh.advertiseService(segments_publisher_.getTopic() + "/reset", &FrontEndNodelet::OnReset, this);
   if (parameters_.pose_source == PoseSource::kOdometry)
-    odometry_subscriber_ = nh.subscribe("odometry", 200, &FrontEndNodelet::OnOdometry, this);
+    pose_subscriber_ = nh.subscribe("odometry", 200, &FrontEndNodelet::OnOdometry, this);
+  if (parameters_.pose_source == PoseSource::kPose)
+    pose_subscriber_ = nh.subscribe("pose", 200, &FrontEndNodelet::OnPose, this);
   if (parameters_.frame_jumps)
     trajectory_subscriber_ = nh.subscribe("trajectory", 1, &FrontEndNodelet::OnTrajectory, this);
-  cloud_subscriber_ =
-      nh.subscribe("points", static_cast<std::uint32_t>(parameters_.queue_size), &FrontEndNodelet::OnCloud, this);
+  cloud_subscriber_ = nh.subscribe("points", kCallbackQueue, &FrontEndNodelet::OnCloud, this);
 
   diagnostics_ = std::make_unique<diagnostic_updater::Updater>(nh, getPrivateNodeHandle(), getName());
   diagnostics_->setHardwareID("none");
   diagnostics_->add("front end", this, &FrontEndNodelet::Diagnose);
-  diagnostics_timer_ =
-      nh.createWallTimer(ros::WallDuration(1.0), [this](const ros::WallTimerEvent&) { diagnostics_->force_update(); });
+  diagnostics_timer_ = nh.createWallTimer(ros::WallDuration(1.0), [this](const ros::WallTimerEvent&) {
+    diagnostics_->force_update();
+    SayWhatIsMissing();
+  });
+  tuning_ = std::make_unique<Tuning<FrontEndConfig>>(
+      getPrivateNodeHandle(), ToConfig(parameters),
+      [this](const FrontEndConfig& config) { worker_->Run([this, &config] { Change(config); }); });
+  throttle_.IsDue("missing", kMissingPeriod_s);  // time to start for everybody, before something is missing
   NODELET_INFO("front end of %s: clouds from %s, poses from %s", parameters_.robot.c_str(),
                cloud_subscriber_.getTopic().c_str(),
-               parameters_.pose_source == PoseSource::kTf ? "tf" : odometry_subscriber_.getTopic().c_str());
+               parameters_.pose_source == PoseSource::kTf ? "tf" : pose_subscriber_.getTopic().c_str());
 }
 
 void FrontEndNodelet::OnCloud(const sensor_msgs::PointCloud2ConstPtr& cloud) {
+  const double age_s = (ros::Time::now() - cloud->header.stamp).toSec();
   {
     const std::lock_guard<std::mutex> lock(mutex_);
     ++status_.received;
+    status_.stamp_age_s = age_s;
   }
+  if (std::abs(age_s) > kStale_s && !cloud->header.stamp.isZero() && !ros::Time::now().isZero() &&
+      throttle_.IsDue("stale", kStalePeriod_s))
+    NODELET_WARN(
+        "stamps on %s are %.1f s %s ROS time: if a bag plays, set /use_sim_time and play it with --clock; if "
+        "not, the sensor's clock is wrong. Clouds are used all the same, at their stamps",
+        cloud_subscriber_.getTopic().c_str(), std::abs(age_s), age_s > 0.0 ? "behind" : "ahead of");
   const std::size_t dropped = worker_->dropped();
   worker_->Post([this, cloud, received = Clock::now()] { ProcessCloud(*cloud, received); });
   if (worker_->dropped() > dropped && throttle_.IsDue("dropped", kWarnPeriod_s))
@@ -97,6 +137,14 @@ void FrontEndNodelet::OnOdometry(const nav_msgs::OdometryConstPtr& odometry) {
   }
 }
 
+void FrontEndNodelet::OnPose(const geometry_msgs::PoseStampedConstPtr& pose) {
+  try {
+    locator_->AddPose(*pose);
+  } catch (const std::invalid_argument& error) {
+    if (throttle_.IsDue("pose", kWarnPeriod_s)) NODELET_WARN("a pose is left out: %s", error.what());
+  }
+}
+
 void FrontEndNodelet::OnTrajectory(const nav_msgs::PathConstPtr& path) {
   worker_->PostAlways([this, path] { FollowJump(*path); });
 }
@@ -105,6 +153,13 @@ bool FrontEndNodelet::OnRequestFullState(RequestFullState::Request& /*request*/,
   worker_->PostAlways([this] { full_state_wanted_ = true; });
   response.success = true;
   response.message = "the next delta is a full state";
+  return true;
+}
+
+bool FrontEndNodelet::OnReset(std_srvs::Trigger::Request& /*request*/, std_srvs::Trigger::Response& response) {
+  worker_->PostAlways([this] { Restart(); });
+  response.success = true;
+  response.message = "the local map of " + parameters_.robot + " is forgotten";
   return true;
 }
 
@@ -125,7 +180,7 @@ void FrontEndNodelet::ProcessCloud(const sensor_msgs::PointCloud2& cloud, Clock:
     history_.push_back({scan.stamp_ns, scan.T_odom_sensor});
     if (history_.size() > kHistorySize) history_.pop_front();
     frames_ = location->frames;
-    Publish(std::move(step), *location);
+    Publish(std::move(step), *location, received);
   } catch (const std::invalid_argument& error) {
     Skip("unusable", error.what());
   }
@@ -144,6 +199,7 @@ bool FrontEndNodelet::AcceptStamp(const sensor_msgs::PointCloud2& cloud) {
     }
     NODELET_WARN("time jumped back by %.1f s (a bag that starts again?): the front end of %s starts over",
                  1e-9 * static_cast<double>(*last_stamp_ns_ - stamp_ns), parameters_.robot.c_str());
+    locator_->Clear();
     Restart();
   }
   last_stamp_ns_ = stamp_ns;
@@ -153,7 +209,6 @@ bool FrontEndNodelet::AcceptStamp(const sensor_msgs::PointCloud2& cloud) {
 void FrontEndNodelet::Restart() {
   front_end_ = std::make_unique<FrontEnd>(core_parameters_, parameters_.robot);
   session_ = std::max(ros::WallTime::now().toNSec(), session_ + 1);
-  locator_->Clear();
   history_.clear();
   const std::lock_guard<std::mutex> lock(mutex_);
   ++status_.restarts;
@@ -162,9 +217,8 @@ void FrontEndNodelet::Restart() {
 std::optional<SensorLocation> FrontEndNodelet::WaitForLocation(const sensor_msgs::PointCloud2& cloud,
                                                                Clock::time_point received) {
   const std::string cloud_frame = FrameName(cloud.header.frame_id);
-  const std::string odom_frame = FrameName(parameters_.odom_frame);
-  if (parameters_.registered && cloud_frame != odom_frame) {
-    Skip("wrong frame", "registered clouds come in frame " + cloud_frame + ", but odom_frame is " + odom_frame);
+  if (parameters_.registered && cloud_frame.empty()) {
+    Skip("no frame", "the registered cloud has no frame_id");
     return std::nullopt;
   }
   const std::string sensor_frame = parameters_.sensor_frame.empty() ? cloud_frame : FrameName(parameters_.sensor_frame);
@@ -174,7 +228,7 @@ std::optional<SensorLocation> FrontEndNodelet::WaitForLocation(const sensor_msgs
   }
   const auto deadline = received + std::chrono::duration<double>(parameters_.pose_timeout_s);
   while (true) {
-    LocateResult result = locator_->Locate(cloud.header.stamp, sensor_frame);
+    LocateResult result = locator_->Locate(cloud.header.stamp, sensor_frame, parameters_.registered ? cloud_frame : "");
     if (result.location) return result.location;
     if (worker_->stopping()) return std::nullopt;
     if (Clock::now() >= deadline) {
@@ -186,7 +240,8 @@ std::optional<SensorLocation> FrontEndNodelet::WaitForLocation(const sensor_msgs
 }
 
 Points FrontEndNodelet::ReadScanPoints(const sensor_msgs::PointCloud2& cloud, const SensorLocation& location) const {
-  return parameters_.registered ? ReadPoints(cloud, location.T_odom_sensor.inverse()) : ReadPoints(cloud);
+  return parameters_.registered ? ReadPoints(cloud, location.T_odom_sensor.inverse() * location.T_odom_registered)
+                                : ReadPoints(cloud);
 }
 
 void FrontEndNodelet::FollowJump(const nav_msgs::Path& path) {
@@ -214,7 +269,7 @@ void FrontEndNodelet::Skip(const std::string& kind, const std::string& reason) {
   if (throttle_.IsDue(kind, kWarnPeriod_s)) NODELET_WARN("%zu scans skipped so far: %s", count, reason.c_str());
 }
 
-void FrontEndNodelet::Publish(FrontEndStep step, const SensorLocation& location) {
+void FrontEndNodelet::Publish(FrontEndStep step, const SensorLocation& location, Clock::time_point received) {
   std_msgs::Header header;
   header.stamp = ToTime(step.delta.stamp_ns);
   header.frame_id = location.frames.odom_frame;
@@ -225,7 +280,7 @@ void FrontEndNodelet::Publish(FrontEndStep step, const SensorLocation& location)
         ToSegmentArray(delta, location.frames, session_, kQuantisation * core_parameters_.grid.resolution_m,
                        parameters_.send_points)));
   }
-  if (local_cloud_publisher_.getNumSubscribers() > 0) PublishLocalCloud(header);
+  if (local_cloud_publisher_.getNumSubscribers() + labels_publisher_.getNumSubscribers() > 0) PublishLocalCloud(header);
   if (steps_publisher_.getNumSubscribers() > 0)
     steps_publisher_.publish(ToStepReport(header, parameters_.robot, step.times, ToNamedCounts(step.counts), ""));
 
@@ -235,17 +290,75 @@ void FrontEndNodelet::Publish(FrontEndStep step, const SensorLocation& location)
   status_.times = step.times;
   status_.memory_bytes = front_end_->memory_bytes();
   status_.distance_m = location.T_odom_sensor.translation().norm();
+  status_.latency_ms = std::chrono::duration<double, std::milli>(Clock::now() - received).count();
 }
 
 void FrontEndNodelet::PublishLocalCloud(const std_msgs::Header& header) {
   std::vector<ColouredPoint> points;
-  for (const LocalPoint& point : front_end_->LocalCloud())
-    points.push_back({point.position_odom, SegmentColour({0, point.segment})});
-  local_cloud_publisher_.publish(boost::make_shared<const sensor_msgs::PointCloud2>(ToPointCloud2(points, header)));
+  std::map<SegmentId, Label> labels;
+  for (const LocalPoint& point : front_end_->LocalCloud()) {
+    const std::uint32_t colour = SegmentColour({0, point.segment});
+    points.push_back({point.position_odom, colour});
+    if (point.segment == kNoSegment) continue;
+    Label& label = labels
+                       .try_emplace(point.segment,
+                                    Label{point.position_odom.cast<double>(), std::to_string(point.segment), colour})
+                       .first->second;
+    if (point.position_odom.z() > label.position.z()) label.position = point.position_odom.cast<double>();
+  }
+  if (local_cloud_publisher_.getNumSubscribers() > 0)
+    local_cloud_publisher_.publish(boost::make_shared<const sensor_msgs::PointCloud2>(ToPointCloud2(points, header)));
+  if (labels_publisher_.getNumSubscribers() == 0) return;
+  std::vector<Label> list;
+  for (auto& [segment, label] : labels) {
+    label.position.z() += kLabelHeight_m;
+    list.push_back(std::move(label));
+  }
+  labels_publisher_.publish(LabelMarkers(list, "local", kLetter_m, header));
+}
+
+/// Throws std::invalid_argument, naming the parameter, if the core refuses: nothing has changed then.
+void FrontEndNodelet::Change(const FrontEndConfig& config) {
+  NodeletParameters<FrontEndNodeParameters> parameters{parameters_, Parameters()};
+  parameters.core.front_end = core_parameters_;
+  try {
+    parameters = WithConfig(std::move(parameters), config);
+    const FrontEndParameters& core = parameters.core.front_end;
+    front_end_->ChangeParameters(core.ground, core.local_radius_m, core.view);
+  } catch (const std::invalid_argument& error) {
+    NODELET_WARN("a change of the parameters is refused: %s", error.what());
+    throw;
+  }
+  core_parameters_ = parameters.core.front_end;
+  parameters_.pose_timeout_s = parameters.node.pose_timeout_s;
+  NODELET_INFO("the parameters have changed");
+}
+
+/// In words, why nothing can come; empty if that is not known.
+std::string FrontEndNodelet::WhatIsMissing() const {
+  if (ros::Time::isSimTime() && ros::Time::now().isZero())
+    return "/use_sim_time is set, but nobody publishes /clock: play the bag with --clock, or unset it";
+  if (cloud_subscriber_.getNumPublishers() == 0)
+    return "nobody publishes " + cloud_subscriber_.getTopic() + "; " + CloudTopics();
+  if (parameters_.pose_source != PoseSource::kTf && pose_subscriber_.getNumPublishers() == 0)
+    return "nobody publishes " + pose_subscriber_.getTopic() + ", from which the sensor's poses are to come";
+  return "";
+}
+
+/// A reminder in the log, as long as nothing has come at all.
+void FrontEndNodelet::SayWhatIsMissing() {
+  {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    if (status_.processed > 0) return;
+  }
+  if (!throttle_.IsDue("missing", kMissingPeriod_s)) return;
+  const std::string missing = WhatIsMissing();
+  if (!missing.empty()) NODELET_WARN("%s", missing.c_str());
 }
 
 void FrontEndNodelet::Diagnose(diagnostic_updater::DiagnosticStatusWrapper& status) {
   using diagnostic_msgs::DiagnosticStatus;
+  const std::string missing = WhatIsMissing();
   const std::lock_guard<std::mutex> lock(mutex_);
   const Clock::time_point now = Clock::now();
   const double elapsed_s = std::chrono::duration<double>(now - status_.reported).count();
@@ -253,10 +366,8 @@ void FrontEndNodelet::Diagnose(diagnostic_updater::DiagnosticStatusWrapper& stat
   for (const auto& [kind, count] : status_.skipped) skipped += count;
   const double rate_hz = static_cast<double>(status_.processed - status_.reported_processed) / elapsed_s;
 
-  if (ros::Time::isSimTime() && ros::Time::now().isZero())
-    status.summary(DiagnosticStatus::WARN, "use_sim_time is set, but nothing publishes /clock");
-  else if (cloud_subscriber_.getNumPublishers() == 0 && status_.received == status_.reported_received)
-    status.summary(DiagnosticStatus::WARN, "nobody publishes " + cloud_subscriber_.getTopic());
+  if (!missing.empty() && status_.received == status_.reported_received)
+    status.summary(DiagnosticStatus::WARN, missing);
   else if (skipped != status_.reported_skipped)
     status.summary(DiagnosticStatus::WARN, "scans are skipped: " + status_.last_skip);
   else if (parameters_.registered && status_.distance_m > kCoarseFloatDistance_m)
@@ -274,6 +385,8 @@ void FrontEndNodelet::Diagnose(diagnostic_updater::DiagnosticStatusWrapper& stat
   status.add("scans dropped by the full queue", worker_->dropped());
   for (const auto& [kind, count] : status_.skipped) status.add("scans skipped: " + kind, count);
   status.add("starts over", status_.restarts);
+  status.addf("stamps behind ROS time [s]", "%.3f", status_.stamp_age_s);
+  status.addf("arrival to segments [ms]", "%.1f", status_.latency_ms);
   for (const auto& [name, value] : ToNamedCounts(status_.counts)) status.add(name, value);
   for (const auto& [stage, milliseconds] : status_.times) status.addf(stage + " [ms]", "%.2f", milliseconds);
   status.addf("memory [MB]", "%.1f", 1e-6 * static_cast<double>(status_.memory_bytes));

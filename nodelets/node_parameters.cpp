@@ -25,6 +25,10 @@ std::string DoubleToYaml(double value) {
   return text;
 }
 
+void Require(bool condition, const std::string& full_name, const std::string& what) {
+  if (!condition) throw std::invalid_argument("parameter " + full_name + ": " + what);
+}
+
 /// Hands out the values of one subtree and remembers which were asked for.
 class SubtreeReader {
  public:
@@ -77,7 +81,7 @@ class SubtreeReader {
   std::string Full(const std::string& name) const { return path_ + "/" + name; }
 
   void Require(bool condition, const std::string& name, const std::string& what) const {
-    if (!condition) throw std::invalid_argument("parameter " + Full(name) + ": " + what);
+    incremental_segmatch::Require(condition, Full(name), what);
   }
 
  private:
@@ -121,6 +125,7 @@ SubtreeReader ReadTree(const ros::NodeHandle& private_nh) {
   }
   SubtreeReader reader(tree, private_nh.getNamespace());
   reader.Take("diagnostic_period");  // read by diagnostic_updater
+  reader.Take("tuning");             // left by dynamic_reconfigure, for people to see
   return reader;
 }
 
@@ -160,7 +165,8 @@ NodeletParameters<FrontEndNodeParameters> ReadFrontEndParameters(const ros::Node
   NodeletParameters<FrontEndNodeParameters> parameters;
   FrontEndNodeParameters& node = parameters.node;
   reader.Read("robot", node.robot);
-  reader.Read("pose_source", node.pose_source, {{"tf", PoseSource::kTf}, {"odometry", PoseSource::kOdometry}});
+  reader.Read("pose_source", node.pose_source,
+              {{"tf", PoseSource::kTf}, {"odometry", PoseSource::kOdometry}, {"pose", PoseSource::kPose}});
   reader.Read("registered", node.registered);
   reader.Read("odom_frame", node.odom_frame);
   reader.Read("base_frame", node.base_frame);
@@ -173,13 +179,7 @@ NodeletParameters<FrontEndNodeParameters> ReadFrontEndParameters(const ros::Node
   reader.Read("send_points", node.send_points);
   parameters.core = ReadCore(reader, "front_end");
   reader.RefuseOthers();
-  reader.Require(!node.robot.empty(), "robot", "must not be empty");
-  reader.Require(!node.odom_frame.empty(), "odom_frame", "must not be empty");
-  reader.Require(!node.registered || !node.sensor_frame.empty(), "sensor_frame",
-                 "must be set where clouds are registered: their frame_id does not tell it");
-  reader.Require(node.pose_timeout_s >= 0.0, "pose_timeout_s", "must not be negative");
-  reader.Require(node.odometry_max_gap_s > 0.0, "odometry_max_gap_s", "must be positive");
-  reader.Require(node.queue_size > 0, "queue_size", "must be at least 1");
+  Validate(node, reader.path());
   return parameters;
 }
 
@@ -202,12 +202,7 @@ NodeletParameters<BackEndNodeParameters> ReadBackEndParameters(const ros::NodeHa
   reader.Read("queue_size", node.queue_size);
   parameters.core = ReadCore(reader, "back_end");
   reader.RefuseOthers();
-  reader.Require(!node.map_frame.empty(), "map_frame", "must not be empty");
-  reader.Require(node.closure_min_distance_m >= 0.0, "closure_min_distance_m", "must not be negative");
-  reader.Require(node.closure_min_interval_s >= 0.0, "closure_min_interval_s", "must not be negative");
-  reader.Require(node.tf_tolerance_s >= 0.0, "tf_tolerance_s", "must not be negative");
-  reader.Require(node.display_period_s >= 0.0, "display_period_s", "must not be negative");
-  reader.Require(node.queue_size > 0, "queue_size", "must be at least 1");
+  Validate(node, reader.path());
   reader.Require(parameters.core.back_end.mode != Mode::kLocalization || !node.map_file.empty(), "map_file",
                  "must name a saved map: back_end/mode is localization");
   return parameters;
@@ -229,6 +224,31 @@ PoseGraphNodeParameters ReadPoseGraphParameters(const ros::NodeHandle& private_n
   reader.Require(node.tf_tolerance_s >= 0.0, "tf_tolerance_s", "must not be negative");
   reader.Require(node.queue_size > 0, "queue_size", "must be at least 1");
   return node;
+}
+
+void Validate(const FrontEndNodeParameters& node, const std::string& path) {
+  const auto require = [&path](bool condition, const std::string& name, const std::string& what) {
+    Require(condition, path + "/" + name, what);
+  };
+  require(!node.robot.empty(), "robot", "must not be empty");
+  require(!node.odom_frame.empty(), "odom_frame", "must not be empty");
+  require(!node.registered || !node.sensor_frame.empty(), "sensor_frame",
+          "must be set where clouds are registered: their frame_id does not tell it");
+  require(node.pose_timeout_s >= 0.0, "pose_timeout_s", "must not be negative");
+  require(node.odometry_max_gap_s > 0.0, "odometry_max_gap_s", "must be positive");
+  require(node.queue_size > 0, "queue_size", "must be at least 1");
+}
+
+void Validate(const BackEndNodeParameters& node, const std::string& path) {
+  const auto require = [&path](bool condition, const std::string& name, const std::string& what) {
+    Require(condition, path + "/" + name, what);
+  };
+  require(!node.map_frame.empty(), "map_frame", "must not be empty");
+  require(node.closure_min_distance_m >= 0.0, "closure_min_distance_m", "must not be negative");
+  require(node.closure_min_interval_s >= 0.0, "closure_min_interval_s", "must not be negative");
+  require(node.tf_tolerance_s >= 0.0, "tf_tolerance_s", "must not be negative");
+  require(node.display_period_s >= 0.0, "display_period_s", "must not be negative");
+  require(node.queue_size > 0, "queue_size", "must be at least 1");
 }
 
 std::string ToYamlText(const XmlRpcValue& constant) {

@@ -17,20 +17,22 @@
 namespace incremental_segmatch {
 
 /// Where a front end takes the sensor's pose from.
-enum class PoseSource { kTf, kOdometry };
+enum class PoseSource { kTf, kOdometry, kPose };
 
 /// Of FrontEndNodelet.
 struct FrontEndNodeParameters {
   std::string robot = "robot";               ///< name of the robot, unique among those of one back end
-  PoseSource pose_source = PoseSource::kTf;  ///< `tf` (odom_frame to sensor) or `odometry` (topic, plus tf from its
-                                             ///< child frame to the sensor)
-  bool registered = false;                   ///< clouds are in odom_frame already, instead of in the sensor's frame
-  std::string odom_frame = "odom";           ///< frame that drifts but does not jump
-  std::string base_frame = "base_link";      ///< frame that trajectories and closures are about; empty: the sensor's
-  std::string sensor_frame;                  ///< of the LiDAR; empty: the cloud's frame_id (not possible if registered)
-  double pose_timeout_s = 0.5;               ///< how long a cloud waits for its pose, by the wall clock
-  double odometry_max_gap_s = 0.5;           ///< longest time between odometry messages over which is interpolated
-  bool frame_jumps = false;                  ///< odom_frame jumps at corrections: follow the topic `trajectory`
+  PoseSource pose_source = PoseSource::kTf;  ///< `tf` (odom_frame to sensor), `odometry` (topic, plus tf from its child
+                                             ///< frame to the sensor) or `pose` (topic, of base_frame, plus tf to the
+                                             ///< sensor)
+  bool registered =
+      false;  ///< clouds are in odom_frame, or one that tf relates to it, instead of in the sensor's frame
+  std::string odom_frame = "odom";       ///< frame that drifts but does not jump
+  std::string base_frame = "base_link";  ///< frame that trajectories and closures are about; empty: the sensor's
+  std::string sensor_frame;              ///< of the LiDAR; empty: the cloud's frame_id (not possible if registered)
+  double pose_timeout_s = 0.5;           ///< how long a cloud waits for its pose, by the wall clock
+  double odometry_max_gap_s = 0.5;       ///< longest time between two poses of a topic over which is interpolated
+  bool frame_jumps = false;              ///< odom_frame jumps at corrections: follow the topic `trajectory`
   FrameKind trajectory_kind = FrameKind::kBase;  ///< whose poses `trajectory` holds: `base` or `sensor`
   int queue_size = 5;                            ///< clouds; when full, the oldest goes
   bool send_points = true;                       ///< of new views of segments, for refinement
@@ -78,6 +80,10 @@ struct NodeletParameters {
 NodeletParameters<FrontEndNodeParameters> ReadFrontEndParameters(const ros::NodeHandle& private_nh);
 NodeletParameters<BackEndNodeParameters> ReadBackEndParameters(const ros::NodeHandle& private_nh);
 PoseGraphNodeParameters ReadPoseGraphParameters(const ros::NodeHandle& private_nh);
+
+/// Throw std::invalid_argument naming a parameter that is out of range, by its full name below `path`.
+void Validate(const FrontEndNodeParameters& node, const std::string& path = "");
+void Validate(const BackEndNodeParameters& node, const std::string& path = "");
 
 /// A parameter tree as YAML text (flow style). Throws std::invalid_argument for types that YAML has no word for.
 std::string ToYamlText(const XmlRpc::XmlRpcValue& value);

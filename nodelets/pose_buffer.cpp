@@ -55,19 +55,14 @@ std::optional<Pose> PoseBuffer::At(StampNs stamp_ns) const {
   return Interpolate(before, *after, stamp_ns);
 }
 
-bool PoseBuffer::ReachesTo(StampNs stamp_ns) const {
+std::string PoseBuffer::WhyNot(const std::string& topic, StampNs stamp_ns) const {
   const std::lock_guard<std::mutex> lock(mutex_);
-  return !poses_.empty() && poses_.back().stamp_ns >= stamp_ns;
-}
-
-std::string PoseBuffer::WhyNot(StampNs stamp_ns) const {
-  const std::lock_guard<std::mutex> lock(mutex_);
-  if (poses_.empty()) return "no odometry has come";
+  if (poses_.empty()) return "no " + topic + " has come";
   if (stamp_ns > poses_.back().stamp_ns)
-    return "odometry ends " + Seconds(stamp_ns - poses_.back().stamp_ns) + " before it";
+    return topic + " ends " + Seconds(stamp_ns - poses_.back().stamp_ns) + " before it";
   if (stamp_ns < poses_.front().stamp_ns)
-    return "odometry begins " + Seconds(poses_.front().stamp_ns - stamp_ns) + " after it";
-  return "odometry has a gap of more than " + Seconds(max_gap_ns_) + " around it";
+    return topic + " begins " + Seconds(poses_.front().stamp_ns - stamp_ns) + " after it";
+  return topic + " has a gap of more than " + Seconds(max_gap_ns_) + " around it";
 }
 
 }  // namespace incremental_segmatch

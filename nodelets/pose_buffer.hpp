@@ -1,5 +1,5 @@
 /// \file
-/// Odometry messages' poses, interpolated.
+/// The poses of a topic, interpolated.
 #pragma once
 
 #include <deque>
@@ -27,11 +27,8 @@ class PoseBuffer {
   /// are at most the gap apart. O(log poses).
   std::optional<Pose> At(StampNs stamp_ns) const;
 
-  /// True if poses reach up to the stamp: waiting longer brings nothing new.
-  bool ReachesTo(StampNs stamp_ns) const;
-
-  /// In words, why there is no pose at a stamp.
-  std::string WhyNot(StampNs stamp_ns) const;
+  /// In words, why there is no pose at a stamp; `topic` names what the poses come from.
+  std::string WhyNot(const std::string& topic, StampNs stamp_ns) const;
 
  private:
   const StampNs keep_ns_;

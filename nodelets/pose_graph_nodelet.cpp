@@ -25,6 +25,7 @@ PoseGraphNodelet::~PoseGraphNodelet() {
   // First, so that no callback runs any more when the worker goes.
   for (ros::Subscriber& subscriber : subscribers_) subscriber.shutdown();
   write_service_.shutdown();
+  reset_service_.shutdown();
   diagnostics_timer_.stop();
   const bool started = worker_ != nullptr;
   worker_.reset();
@@ -52,6 +53,7 @@ void PoseGraphNodelet::Start() {
   if (parameters_.publish_tf) tf_broadcaster_ = std::make_unique<tf2_ros::TransformBroadcaster>();
   worker_ = std::make_unique<Worker>(parameters_.queue_size, [this](const std::string& what) { Refuse(what); });
   write_service_ = nh.advertiseService("write_trajectories", &PoseGraphNodelet::OnWrite, this);
+  reset_service_ = nh.advertiseService("reset_pose_graph", &PoseGraphNodelet::OnReset, this);
   if (parameters_.robots.empty()) Subscribe("");
   for (const std::string& robot : parameters_.robots) Subscribe(robot);
   const boost::function<void(const LoopClosureConstPtr&)> on_closure = [this](const LoopClosureConstPtr& closure) {
@@ -101,6 +103,16 @@ bool PoseGraphNodelet::OnWrite(std_srvs::Trigger::Request& /*request*/, std_srvs
   return true;
 }
 
+bool PoseGraphNodelet::OnReset(std_srvs::Trigger::Request& /*request*/, std_srvs::Trigger::Response& response) {
+  worker_->PostAlways([this] {
+    sessions_.EndAll();
+    StartOver();
+  });
+  response.success = true;
+  response.message = "the pose graph is forgotten";
+  return true;
+}
+
 void PoseGraphNodelet::StartOver() {
   graph_ = std::make_unique<PoseGraph>(parameters_.pose_graph);
   sessions_.Clear();
@@ -118,6 +130,7 @@ void PoseGraphNodelet::AddPose(const SegmentArray& message, const std::string& p
     StartOver();
     session = sessions_.Find(message.robot, message.session, stamp_ns);
   }
+  if (session.change == RobotSessions::Change::kEnded) return;
   const auto index = static_cast<RobotIndex>(robots_.size());
   const auto [it, is_new] = robots_.try_emplace(session.name);
   Robot& robot = it->second;
@@ -126,9 +139,10 @@ void PoseGraphNodelet::AddPose(const SegmentArray& message, const std::string& p
   robot.frames = ToRobotFrames(message);
   newest_session_[prefix] = session.name;
 
-  const Pose T_odom_sensor = ToPose(message.sensor_pose, "sensor_pose");
-  graph_->AddNode(robot.index, stamp_ns, T_odom_sensor);
-  robot.odometry.push_back({stamp_ns, T_odom_sensor});
+  robot.T_odom_continuous = ToPose(message.continuous_frame, "continuous_frame");
+  const Pose T_continuous_sensor = ContinuousSensorPose(message);
+  graph_->AddNode(robot.index, stamp_ns, T_continuous_sensor);
+  robot.odometry.push_back({stamp_ns, T_continuous_sensor});
   PublishTransform(robot, message.header.stamp);
   if (throttle_.IsDue("paths", kPathPeriod_s)) PublishPaths();
   const std::lock_guard<std::mutex> lock(mutex_);
@@ -183,8 +197,8 @@ bool PoseGraphNodelet::IsInMap(const Robot& robot) const {
 
 void PoseGraphNodelet::PublishTransform(const Robot& robot, const ros::Time& stamp) {
   if (!tf_broadcaster_ || !IsInMap(robot)) return;
-  tf_broadcaster_->sendTransform(ToTransform(graph_->T_map_odom(robot.index), parameters_.map_frame,
-                                             robot.frames.odom_frame,
+  const Pose T_map_odom = graph_->T_map_odom(robot.index) * robot.T_odom_continuous.inverse();
+  tf_broadcaster_->sendTransform(ToTransform(T_map_odom, parameters_.map_frame, robot.frames.odom_frame,
                                              stamp + ros::Duration(parameters_.tf_tolerance_s)));
 }
 

@@ -32,8 +32,8 @@ namespace incremental_segmatch {
 /// prefix, `trajectory` (corrected, in the map frame; after every optimization and now and then) and `odometry_path`
 /// (where odometry alone has the robot; in the map frame, too, as if both began at one place); tf map to odom. A robot
 /// that no closure connects with the first one has no place in the map yet, so neither trajectory nor tf. Serves
-/// `write_trajectories`. At the end, and when asked to, writes trajectories of the sensor (TUM) and the graph (g2o),
-/// where `output_dir` says so.
+/// `write_trajectories` and `reset_pose_graph`. At the end, and when asked to, writes trajectories of the sensor (TUM)
+/// and the graph (g2o), where `output_dir` says so.
 class PoseGraphNodelet : public nodelet::Nodelet {
  public:
   ~PoseGraphNodelet() override;
@@ -46,7 +46,8 @@ class PoseGraphNodelet : public nodelet::Nodelet {
     std::string name;      ///< of the robot; the session's own name is the key
     RobotIndex index = 0;  ///< in the graph
     RobotFrames frames;
-    std::vector<StampedPose> odometry;  ///< T_odom_sensor
+    Pose T_odom_continuous = Pose::Identity();  ///< the jumps of its odometry frame so far
+    std::vector<StampedPose> odometry;          ///< of the sensor, in odometry's frame without its jumps
   };
   struct Publishers {
     ros::Publisher trajectory;
@@ -67,6 +68,7 @@ class PoseGraphNodelet : public nodelet::Nodelet {
   void onInit() override;
   void Start();
   void Subscribe(const std::string& robot);
+  bool OnReset(std_srvs::Trigger::Request& request, std_srvs::Trigger::Response& response);
   bool OnWrite(std_srvs::Trigger::Request& request, std_srvs::Trigger::Response& response);
   void Diagnose(diagnostic_updater::DiagnosticStatusWrapper& status);
 
@@ -90,6 +92,7 @@ class PoseGraphNodelet : public nodelet::Nodelet {
   std::vector<ros::Subscriber> subscribers_;
   std::map<std::string, Publishers> publishers_;  // by prefix
   ros::ServiceServer write_service_;
+  ros::ServiceServer reset_service_;
   ros::WallTimer diagnostics_timer_;
   std::unique_ptr<diagnostic_updater::Updater> diagnostics_;
   std::unique_ptr<tf2_ros::TransformBroadcaster> tf_broadcaster_;

@@ -4,7 +4,9 @@
 
 #include <cstdint>
 #include <map>
+#include <set>
 #include <string>
+#include <utility>
 
 #include "incremental_segmatch/types.hpp"
 
@@ -19,7 +21,8 @@ class RobotSessions {
     kNone,
     kNewRobot,
     kRestarted,  ///< another session, at a later stamp
-    kRewound     ///< another session, at an earlier stamp: time jumped back, as when a bag is played again
+    kRewound,    ///< another session, at an earlier stamp: time jumped back, as when a bag is played again
+    kEnded       ///< a session that was ended: its message is to be left out
   };
   struct Session {
     std::string name;
@@ -28,6 +31,7 @@ class RobotSessions {
 
   /// The session that a message belongs to.
   Session Find(const std::string& robot, std::uint64_t session, StampNs stamp_ns) {
+    if (ended_.count({robot, session}) > 0) return {robot, Change::kEnded};
     const auto [it, is_new] = states_.try_emplace(robot, State{session, 1, stamp_ns});
     State& state = it->second;
     if (is_new) return {robot, Change::kNewRobot};
@@ -41,8 +45,21 @@ class RobotSessions {
     return {state.number == 1 ? robot : robot + "#" + std::to_string(state.number), change};
   }
 
-  /// Forgets everything.
+  /// Forgets all robots; the next message of each is that of a new robot.
   void Clear() { states_.clear(); }
+
+  /// The present session of a robot is over: what still comes of it is left out.
+  void End(const std::string& robot) {
+    const auto state = states_.find(robot);
+    if (state == states_.end()) return;
+    ended_.insert({robot, state->second.session});
+    states_.erase(state);
+  }
+
+  /// Ends those of all robots.
+  void EndAll() {
+    while (!states_.empty()) End(std::string(states_.begin()->first));
+  }
 
  private:
   struct State {
@@ -51,6 +68,7 @@ class RobotSessions {
     StampNs stamp_ns;
   };
   std::map<std::string, State> states_;
+  std::set<std::pair<std::string, std::uint64_t>> ended_;
 };
 
 }  // namespace incremental_segmatch

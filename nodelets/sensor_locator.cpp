@@ -26,32 +26,48 @@ SensorLocator::SensorLocator(const FrontEndNodeParameters& parameters)
     : parameters_(parameters),
       tf_buffer_(ros::Duration(kKeepPoses_s)),
       tf_listener_(tf_buffer_),
-      odometry_(kKeepPoses_s, parameters.odometry_max_gap_s) {}
+      poses_(kKeepPoses_s, parameters.odometry_max_gap_s) {}
 
 void SensorLocator::AddOdometry(const nav_msgs::Odometry& odometry) {
-  odometry_.Add({ToStampNs(odometry.header.stamp), ToPose(odometry.pose.pose, "odometry")});
+  Add({ToStampNs(odometry.header.stamp), ToPose(odometry.pose.pose, "odometry")}, odometry.header.frame_id,
+      odometry.child_frame_id);
+}
+
+void SensorLocator::AddPose(const geometry_msgs::PoseStamped& pose) {
+  Add({ToStampNs(pose.header.stamp), ToPose(pose.pose, "pose")}, pose.header.frame_id, "");
+}
+
+void SensorLocator::Add(const StampedPose& pose, const std::string& frame, const std::string& child_frame) {
+  poses_.Add(pose);
   const std::lock_guard<std::mutex> lock(mutex_);
-  odometry_frame_ = FrameName(odometry.header.frame_id);
-  odometry_child_frame_ = FrameName(odometry.child_frame_id);
+  pose_frame_ = FrameName(frame);
+  pose_child_frame_ = FrameName(child_frame);
 }
 
 void SensorLocator::Clear() {
   tf_buffer_.clear();
-  odometry_.Clear();
+  poses_.Clear();
 }
 
-LocateResult SensorLocator::Locate(const ros::Time& stamp, const std::string& sensor_frame) const {
+LocateResult SensorLocator::Locate(const ros::Time& stamp, const std::string& sensor_frame,
+                                   const std::string& registered_frame) const {
   const std::string odom_frame = FrameName(parameters_.odom_frame);
   const std::string base_frame = parameters_.base_frame.empty() ? sensor_frame : FrameName(parameters_.base_frame);
   const TransformResult odom_sensor = parameters_.pose_source == PoseSource::kTf
                                           ? LookUp(odom_frame, sensor_frame, stamp)
-                                          : LookUpOdometry(sensor_frame, stamp);
+                                          : LookUpPose(sensor_frame, stamp);
   if (!odom_sensor.T_target_source) return {std::nullopt, odom_sensor.reason};
   const TransformResult base_sensor = LookUp(base_frame, sensor_frame, stamp);
   if (!base_sensor.T_target_source)
     return {std::nullopt,
             base_sensor.reason + " (base_frame may be empty where the robot has no other than " + sensor_frame + ")"};
+  const TransformResult odom_registered =
+      LookUp(odom_frame, registered_frame.empty() ? odom_frame : registered_frame, stamp);
+  if (!odom_registered.T_target_source)
+    return {std::nullopt, "registered clouds come in frame " + registered_frame + ", but odom_frame is " + odom_frame +
+                              ", and there is " + odom_registered.reason};
   return {SensorLocation{*odom_sensor.T_target_source,
+                         *odom_registered.T_target_source,
                          {odom_frame, base_frame, sensor_frame, *base_sensor.T_target_source}},
           ""};
 }
@@ -67,24 +83,30 @@ SensorLocator::TransformResult SensorLocator::LookUp(const std::string& target, 
   }
 }
 
-SensorLocator::TransformResult SensorLocator::LookUpOdometry(const std::string& sensor_frame,
-                                                             const ros::Time& stamp) const {
+/// The pose of a topic, from its frame into odom_frame, and from what it is a pose of to the sensor.
+SensorLocator::TransformResult SensorLocator::LookUpPose(const std::string& sensor_frame,
+                                                         const ros::Time& stamp) const {
+  const std::string topic = parameters_.pose_source == PoseSource::kOdometry ? "odometry" : "pose";
+  const std::string odom_frame = FrameName(parameters_.odom_frame);
   std::string frame;
   std::string child_frame;
   {
     const std::lock_guard<std::mutex> lock(mutex_);
-    frame = odometry_frame_;
-    child_frame = odometry_child_frame_.empty() ? FrameName(parameters_.base_frame) : odometry_child_frame_;
+    frame = pose_frame_;
+    child_frame = pose_child_frame_.empty() ? FrameName(parameters_.base_frame) : pose_child_frame_;
   }
-  const std::optional<Pose> T_odom_child = odometry_.At(ToStampNs(stamp));
-  if (!T_odom_child)
-    return {std::nullopt, "no odometry pose at " + Text(stamp) + ": " + odometry_.WhyNot(ToStampNs(stamp))};
-  if (frame != FrameName(parameters_.odom_frame))
-    return {std::nullopt, "odometry is in frame " + frame + ", but odom_frame is " + parameters_.odom_frame};
   if (child_frame.empty()) child_frame = sensor_frame;
+  const std::optional<Pose> T_frame_child = poses_.At(ToStampNs(stamp));
+  if (!T_frame_child)
+    return {std::nullopt, "no pose at " + Text(stamp) + ": " + poses_.WhyNot(topic, ToStampNs(stamp))};
+  const TransformResult odom_frame_T = LookUp(odom_frame, frame, stamp);
+  if (!odom_frame_T.T_target_source)
+    return {std::nullopt, topic + " is in frame " + frame + ", but odom_frame is " + odom_frame + ", and there is " +
+                              odom_frame_T.reason};
   const TransformResult child_sensor = LookUp(child_frame, sensor_frame, stamp);
-  if (!child_sensor.T_target_source) return {std::nullopt, child_sensor.reason + " (odometry's child frame)"};
-  return {*T_odom_child * *child_sensor.T_target_source, ""};
+  if (!child_sensor.T_target_source)
+    return {std::nullopt, child_sensor.reason + " (" + topic + " gives the pose of " + child_frame + ")"};
+  return {*odom_frame_T.T_target_source * *T_frame_child * *child_sensor.T_target_source, ""};
 }
 
 std::string SensorLocator::KnownFrames() const {

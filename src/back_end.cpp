@@ -61,6 +61,33 @@ Covariance6 CovarianceAtQuery(const Covariance6& covariance_map, const Pose& T_m
   return 0.5 * (covariance + covariance.transpose());
 }
 
+/// A delta in the frame that odom would be without its jumps.
+SegmentDelta InContinuousFrame(const SegmentDelta& delta) {
+  const Pose T_continuous_odom = delta.T_odom_continuous.inverse();
+  const Eigen::Matrix3f R = T_continuous_odom.linear().cast<float>();
+  SegmentDelta continuous = delta;
+  continuous.T_odom_sensor = T_continuous_odom * delta.T_odom_sensor;
+  for (SegmentState& state : continuous.changed) {
+    state.centroid_odom = T_continuous_odom * state.centroid_odom;
+    if (!state.points_centroid) continue;
+    auto points = std::make_shared<Points>(*state.points_centroid);
+    for (Eigen::Vector3f& p : *points) p = R * p;
+    state.points_centroid = std::move(points);
+  }
+  return continuous;
+}
+
+/// A step's results in odom as it is now.
+void TakeToJumpingFrame(const Pose& T_odom_continuous, BackEndStep* step) {
+  for (SegmentMatch& match : step->candidates) match.centroid_local_odom = T_odom_continuous * match.centroid_local_odom;
+  for (std::optional<Closure>* closure : {&step->closure, &step->refused}) {
+    if (!*closure) continue;
+    (*closure)->T_map_odom = (*closure)->T_map_odom * T_odom_continuous.inverse();
+    for (SegmentMatch& match : (*closure)->matches)
+      match.centroid_local_odom = T_odom_continuous * match.centroid_local_odom;
+  }
+}
+
 double LargestSigma(const Eigen::Matrix3d& covariance) {
   return std::sqrt(std::max(0.0, Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d>(covariance, Eigen::EigenvaluesOnly).eigenvalues()[2]));
 }
@@ -117,18 +144,45 @@ BackEnd::BackEnd(const BackEndParameters& parameters, TargetMap map, RecognizeFu
 }
 
 BackEndStep BackEnd::Process(const SegmentDelta& delta) {
-  BackEndStep step;
   const RobotIndex robot = RobotByName(delta.robot);
   if (!delta.full_state && delta.sequence != robots_[robot].sequence + 1) {
-    step.missed_delta = true;
-    return step;
+    BackEndStep missed;
+    missed.missed_delta = true;
+    return missed;
   }
   StageTimer timer;
 
-  ApplyDelta(delta, robot);
+  robots_[robot].T_odom_continuous = delta.T_odom_continuous;
+  if (delta.T_odom_continuous.matrix() == Pose::Identity().matrix()) {
+    ApplyDelta(delta, robot);
+  } else {
+    ApplyDelta(InContinuousFrame(delta), robot);
+  }
   ReleaseTargets(delta.stamp_ns);
   timer.Lap("target_update");
+  return AttemptRecognition(robot, std::move(timer));
+}
 
+BackEndStep BackEnd::RecognizeAgain(const std::string& name) {
+  for (RobotIndex robot = loaded_robots_; robot < robots_.size(); ++robot)
+    if (robots_[robot].name == name && robots_[robot].started) return AttemptRecognition(robot, StageTimer());
+  throw std::invalid_argument("no segments have come from robot " + name);
+}
+
+void BackEnd::ChangeParameters(const BackEndParameters& parameters) {
+  if (parameters.mode != parameters_.mode) throw std::invalid_argument("back_end.mode: can't be changed while running");
+  if (parameters.target_map.max_views != parameters_.target_map.max_views)
+    throw std::invalid_argument("back_end.target_map.max_views: can't be changed while running");
+  BackEnd(parameters, TargetMap(parameters.target_map));  // refuses what is out of range
+  parameters_ = parameters;
+  recognizers_.clear();
+  for (Robot& robot : robots_)
+    for (auto& [id, segment] : robot.local) segment.queried.resize(0);
+}
+
+/// Matches a robot's local segments and looks for the place. The step's times begin with what the timer holds.
+BackEndStep BackEnd::AttemptRecognition(RobotIndex robot, StageTimer timer) {
+  BackEndStep step;
   for (auto& [id, segment] : robots_[robot].local)
     if (MatchSegment(robot, &segment)) ++step.counts.requeried;
   const std::map<RobotIndex, Correspondences> by_frame = CollectCorrespondences(robot);
@@ -139,7 +193,7 @@ BackEndStep BackEnd::Process(const SegmentDelta& delta) {
 
   step.counts.end = ToStepEnd(result.outcome);
   if (result.recognition) {
-    std::optional<Closure> judged = Verify(robot, delta.stamp_ns, result, &step.counts);
+    std::optional<Closure> judged = Verify(robot, robots_[robot].stamp_ns, result, &step.counts);
     if (step.counts.end == StepEnd::kRecognized) {
       step.closure = std::move(judged);
       AcceptClosure(robot, *step.closure);
@@ -166,6 +220,7 @@ BackEndStep BackEnd::Process(const SegmentDelta& delta) {
   } else if (index_.segments() == 0) {
     step.counts.end = StepEnd::kNoTargets;
   }
+  TakeToJumpingFrame(robots_[robot].T_odom_continuous, &step);
   return step;
 }
 
@@ -198,6 +253,7 @@ void BackEnd::ApplyDelta(const SegmentDelta& delta, RobotIndex index) {
   if (robot.started) robot.path_m += (robot.T_odom_sensor.inverse() * delta.T_odom_sensor).translation().norm();
   robot.started = true;
   robot.sequence = delta.sequence;
+  robot.stamp_ns = delta.stamp_ns;
   robot.T_odom_sensor = delta.T_odom_sensor;
   if (IsLoopClosure()) {
     const std::uint32_t pose = map_.AddPose(index, delta.stamp_ns, delta.T_odom_sensor);

@@ -20,6 +20,12 @@ std::unique_ptr<Segmenter> MakeSegmenter(const FrontEndParameters& parameters, c
                                                                   SmoothnessPolicy(parameters.smoothness, *normals));
 }
 
+void Validate(double local_radius_m, const ViewParameters& view) {
+  if (!(local_radius_m > 0.0)) throw std::invalid_argument("front_end.local_radius_m: must be positive");
+  if (!(view.growth_factor > 1.0)) throw std::invalid_argument("front_end.view.growth_factor: must exceed 1");
+  if (!(view.baseline_m > 0.0)) throw std::invalid_argument("front_end.view.baseline_m: must be positive");
+}
+
 }  // namespace
 
 FrontEnd::FrontEnd(const FrontEndParameters& parameters, std::string robot)
@@ -30,9 +36,16 @@ FrontEnd::FrontEnd(const FrontEndParameters& parameters, std::string robot)
       normals_(MakeNormals(parameters, grid_)),
       segmenter_(MakeSegmenter(parameters, grid_, normals_.get())),
       describer_(parameters.descriptor, parameters.grid.resolution_m) {
-  if (!(parameters.local_radius_m > 0.0)) throw std::invalid_argument("front_end.local_radius_m: must be positive");
-  if (!(parameters.view.growth_factor > 1.0)) throw std::invalid_argument("front_end.view.growth_factor: must exceed 1");
-  if (!(parameters.view.baseline_m > 0.0)) throw std::invalid_argument("front_end.view.baseline_m: must be positive");
+  Validate(parameters.local_radius_m, parameters.view);
+}
+
+void FrontEnd::ChangeParameters(const GroundFilterParameters& ground, double local_radius_m,
+                                const ViewParameters& view) {
+  Validate(local_radius_m, view);
+  ground_filter_ = GroundFilter(ground);
+  parameters_.ground = ground;
+  parameters_.local_radius_m = local_radius_m;
+  parameters_.view = view;
 }
 
 FrontEndStep FrontEnd::Process(const Scan& scan) {
@@ -40,7 +53,8 @@ FrontEndStep FrontEnd::Process(const Scan& scan) {
     throw std::invalid_argument("scan at " + std::to_string(scan.stamp_ns) + " ns is not after the last one at " +
                                 std::to_string(last_stamp_ns_) + " ns; start a new front end when time goes back");
   if (!scan.T_odom_sensor.matrix().allFinite())
-    throw std::invalid_argument("the sensor pose of the scan at " + std::to_string(scan.stamp_ns) + " ns is not finite");
+    throw std::invalid_argument("the sensor pose of the scan at " + std::to_string(scan.stamp_ns) +
+                                " ns is not finite");
   started_ = true;
   last_stamp_ns_ = scan.stamp_ns;
   last_T_odom_sensor_ = scan.T_odom_sensor;
@@ -90,6 +104,7 @@ FrontEndStep FrontEnd::Process(const Scan& scan) {
 void FrontEnd::ApplyJump(const Pose& T_new_old) {
   grid_.Transform(T_new_old);
   last_T_odom_sensor_ = T_new_old * last_T_odom_sensor_;
+  T_odom_continuous_ = T_new_old * T_odom_continuous_;
   for (auto& [segment, tracked] : tracked_) tracked.view_position_odom = T_new_old * tracked.view_position_odom;
   jumped_ = true;
 }
@@ -156,6 +171,7 @@ SegmentDelta FrontEnd::EmptyDelta() const {
   delta.sequence = sequence_;
   delta.stamp_ns = last_stamp_ns_;
   delta.T_odom_sensor = last_T_odom_sensor_;
+  delta.T_odom_continuous = T_odom_continuous_;
   return delta;
 }
 

@@ -137,12 +137,20 @@ class BackEnd {
   /// Applies a delta of a robot and attempts a recognition.
   BackEndStep Process(const SegmentDelta& delta);
 
+  /// Attempts a recognition once more, from the last delta of a robot: after a change of the parameters, say. Throws
+  /// std::invalid_argument if nothing has come from that robot.
+  BackEndStep RecognizeAgain(const std::string& robot);
+
+  /// Changes parameters between two deltas. Throws std::invalid_argument naming the parameter that is out of range, or
+  /// that holds for life (mode, target_map): nothing has changed then. All local segments are matched anew.
+  void ChangeParameters(const BackEndParameters& parameters);
+
   /// The corrected trajectory of a robot (sensor poses in the map): its target segments move along. O(map).
   void CorrectTrajectory(const std::string& robot, const std::vector<StampedPose>& T_map_sensor);
 
   /// The target map.
   const TargetMap& map() const { return map_; }
-  /// As given to the constructor.
+  /// As given to the constructor, or changed since.
   const BackEndParameters& parameters() const { return parameters_; }
   /// Memory held, about. O(map).
   std::size_t memory_bytes() const;
@@ -167,9 +175,11 @@ class BackEnd {
     RobotIndex frame = 0;  // robots with the same value share a map frame
     bool started = false;
     std::uint64_t sequence = 0;
+    StampNs stamp_ns = 0;
     double path_m = 0.0;
     std::vector<double> path_at_pose_m;  // in loop closure, by index of trajectory pose
-    Pose T_odom_sensor = Pose::Identity();
+    Pose T_odom_sensor = Pose::Identity();      // odom without its jumps, here and in all else that is kept
+    Pose T_odom_continuous = Pose::Identity();  // and the jumps
     std::map<SegmentId, LocalSegment> local;
   };
   // A segment that is no longer tracked, and waits for the time window to pass.
@@ -180,6 +190,7 @@ class BackEnd {
 
   RobotIndex RobotByName(const std::string& name);
   bool IsLoopClosure() const { return parameters_.mode == Mode::kLoopClosure; }
+  BackEndStep AttemptRecognition(RobotIndex robot, StageTimer timer);
   void ApplyDelta(const SegmentDelta& delta, RobotIndex robot);
   void RetireSegment(RobotIndex robot, const RetiredSegment& retired);
   void RenameSegment(RobotIndex robot, const RenamedSegment& renamed);

@@ -77,8 +77,13 @@ class FrontEnd {
   FrontEndStep Process(const Scan& scan);
 
   /// The odometry frame jumped (a correction by the SLAM stack): local cloud and segments move along, and tracking goes
-  /// on. O(1) for the cloud; the next delta reports every tracked segment as changed.
+  /// on. O(1) for the cloud; the next delta reports every tracked segment as changed, and all deltas from then on the
+  /// jump, so that the map side knows that nothing has moved.
   void ApplyJump(const Pose& T_new_old);
+
+  /// Changes what may change between two scans; the other parameters hold for life. Throws std::invalid_argument
+  /// naming the parameter that is out of range: nothing has changed then.
+  void ChangeParameters(const GroundFilterParameters& ground, double local_radius_m, const ViewParameters& view);
 
   /// Every tracked segment, as a delta with full_state set, with the sequence number of the last delta.
   SegmentDelta FullState() const;
@@ -88,7 +93,7 @@ class FrontEnd {
 
   /// Name of the robot.
   const std::string& robot() const { return robot_; }
-  /// As given to the constructor.
+  /// As given to the constructor, or changed since.
   const FrontEndParameters& parameters() const { return parameters_; }
   /// Which features the descriptors have.
   const Describer& describer() const { return describer_; }
@@ -118,6 +123,7 @@ class FrontEnd {
   std::uint64_t sequence_ = 0;
   bool started_ = false;
   bool jumped_ = false;
+  Pose T_odom_continuous_ = Pose::Identity();
   StampNs last_stamp_ns_ = 0;
   Pose last_T_odom_sensor_ = Pose::Identity();
 };

@@ -30,6 +30,9 @@ struct SegmentDelta {
   std::uint64_t sequence = 0;             ///< consecutive
   StampNs stamp_ns = 0;                   ///< of the scan
   Pose T_odom_sensor = Pose::Identity();  ///< where the sensor was
+  /// All jumps of odom so far: the pose of the frame that odom would be without them. The identity where it never
+  /// jumps. A sum and not the last one, so that none is lost with a delta.
+  Pose T_odom_continuous = Pose::Identity();
   bool full_state = false;                ///< `changed` holds every tracked segment, and replaces all said before
   std::vector<SegmentState> changed;      ///< ascending IDs
   std::vector<RenamedSegment> renamed;    ///< merged segments

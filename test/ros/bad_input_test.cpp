@@ -1,5 +1,7 @@
 // What a user may get wrong, and the message that comes.
 #include <diagnostic_msgs/DiagnosticArray.h>
+#include <dynamic_reconfigure/Reconfigure.h>
+#include <geometry_msgs/PoseStamped.h>
 #include <gtest/gtest.h>
 #include <incremental_segmatch/RequestFullState.h>
 #include <nav_msgs/Odometry.h>
@@ -11,6 +13,7 @@
 #include <tf2_ros/transform_broadcaster.h>
 
 #include <algorithm>
+#include <cmath>
 #include <limits>
 #include <map>
 #include <string>
@@ -49,8 +52,9 @@ class BadInput : public testing::Test {
     nodelet::NodeletLoad load;
     load.request.name = "/" + name;
     load.request.type = "incremental_segmatch/" + type;
-    for (const std::string topic : {"points", "odometry", "segments", "local_cloud", "front_end_steps", "loop_closures",
-                                    "trajectory", "save_map", "load_map", "back_end_steps"}) {
+    for (const std::string topic :
+         {"points", "odometry", "pose", "segments", "local_cloud", "local_labels", "front_end_steps", "loop_closures",
+          "reset", "trigger", "trajectory", "save_map", "load_map", "back_end_steps"}) {
       load.request.remap_source_args.push_back("/" + topic);
       load.request.remap_target_args.push_back("/" + prefix + "/" + topic);
     }
@@ -78,7 +82,12 @@ class BadInput : public testing::Test {
   }
 
   testing::AssertionResult Hears(const std::string& words, int level = rosgraph_msgs::Log::WARN) {
-    if (WaitFor([&] { return IsSaid(words, level); }, 5.0)) return testing::AssertionSuccess();
+    return HearsWithin(words, 5.0, level);
+  }
+
+  testing::AssertionResult HearsWithin(const std::string& words, double timeout_s,
+                                       int level = rosgraph_msgs::Log::WARN) {
+    if (WaitFor([&] { return IsSaid(words, level); }, timeout_s)) return testing::AssertionSuccess();
     testing::AssertionResult result = testing::AssertionFailure() << "nobody said \"" << words << "\", but:";
     for (const auto& line : said_) result << "\n  " << line.second;
     return result;
@@ -108,6 +117,7 @@ class BadInput : public testing::Test {
   ros::Publisher clouds_;
   ros::Subscriber segments_, log_, diagnostics_;
   tf2_ros::TransformBroadcaster tf_;
+  tf2_ros::StaticTransformBroadcaster static_tf_;
   std::vector<SegmentArray> received_;
   std::vector<std::pair<int, std::string>> said_;
   std::map<std::string, std::map<std::string, std::string>> diagnosed_;
@@ -253,13 +263,104 @@ TEST_F(BadInput, OdometryIsInterpolatedBetweenMessages) {
   EXPECT_TRUE(Hears("odometry ends"));
 }
 
+TEST_F(BadInput, PosesOfATopicAreThoseOfTheBase) {
+  ros::param::set("/pose_topic/pose_source", "pose");
+  ros::param::set("/pose_topic/base_frame", "base");
+  ASSERT_TRUE(LoadAndConnect("pose_topic"));
+  ros::Publisher publisher = nh_.advertise<geometry_msgs::PoseStamped>("/pose_topic/pose", 10);
+  ASSERT_TRUE(WaitFor([&] { return publisher.getNumSubscribers() > 0; }));
+
+  geometry_msgs::PoseStamped pose;
+  pose.header.stamp = ToTime(drive_->stamp_ns(1));
+  pose.header.frame_id = "odom";
+  publisher.publish(pose);  // no orientation
+  EXPECT_TRUE(Hears("a pose is left out: pose: its quaternion has length 0"));
+
+  Pose T_odom_base = Pose::Identity();
+  T_odom_base.linear() = Eigen::AngleAxisd(0.5 * M_PI, Eigen::Vector3d::UnitZ()).toRotationMatrix();
+  T_odom_base.translation() << 5.0, 6.0, 0.0;
+  pose.pose = ToPoseMsg(T_odom_base);
+  publisher.publish(pose);
+  clouds_.publish(drive_->Cloud(1, "lidar_h"));
+  EXPECT_TRUE(Hears("no tf from base to lidar_h"));
+
+  Pose T_base_lidar = Pose::Identity();
+  T_base_lidar.translation() << 1.0, 0.0, 2.0;
+  static_tf_.sendTransform(ToTransform(T_base_lidar, "base", "lidar_h", ros::Time::now()));
+  pose.header.stamp = ToTime(drive_->stamp_ns(2));
+  publisher.publish(pose);
+  clouds_.publish(drive_->Cloud(2, "lidar_h"));
+  ASSERT_TRUE(WaitFor([this] { return received_.size() == 1; }, 5.0));
+  EXPECT_LT((ToVector(received_[0].sensor_pose.position) - Eigen::Vector3d(5.0, 7.0, 2.0)).norm(), 1e-9);
+  EXPECT_EQ(received_[0].base_frame, "base");
+}
+
+TEST_F(BadInput, WhatIsMissingIsSaidWithoutBeingAsked) {
+  ros::param::set("/waiting/pose_source", "odometry");
+  ros::Publisher elsewhere = nh_.advertise<sensor_msgs::PointCloud2>("/lidar_front/points_raw", 1);
+  ASSERT_TRUE(LoadNodelet("waiting", "FrontEndNodelet", "waiting"));
+  EXPECT_TRUE(HearsWithin("nobody publishes /waiting/points; PointCloud2 is published on:", 15.0));
+  EXPECT_TRUE(Hears("/lidar_front/points_raw"));
+  EXPECT_FALSE(IsSaid("/waiting/local_cloud", rosgraph_msgs::Log::WARN)) << "its own output was offered as input";
+  clouds_ = nh_.advertise<sensor_msgs::PointCloud2>("/waiting/points", 10);
+  EXPECT_TRUE(HearsWithin("nobody publishes /waiting/odometry", 15.0));
+}
+
+TEST_F(BadInput, ParametersChangeWhileRunningAndARefusalIsExplained) {
+  ASSERT_TRUE(LoadAndConnect("tuned"));
+  ASSERT_TRUE(LoadNodelet("tuned_map", "BackEndNodelet", "tuned"));
+  const auto set = [](const std::string& server, const std::string& name, double value) {
+    dynamic_reconfigure::Reconfigure change;
+    change.request.config.doubles.emplace_back();
+    change.request.config.doubles.back().name = name;
+    change.request.config.doubles.back().value = value;
+    EXPECT_TRUE(ros::service::waitForService(server + "/tuning/set_parameters", 5000));
+    EXPECT_TRUE(ros::service::call(server + "/tuning/set_parameters", change));
+    return change.response.config;
+  };
+  const auto value = [](const dynamic_reconfigure::Config& config, const std::string& name) {
+    for (const auto& parameter : config.doubles)
+      if (parameter.name == name) return parameter.value;
+    return std::nan("");
+  };
+  const auto refused = [](const dynamic_reconfigure::Config& config) {
+    for (const auto& parameter : config.strs)
+      if (parameter.name == "refused") return parameter.value;
+    return std::string("not there");
+  };
+  dynamic_reconfigure::Config config = set("/tuned_map", "epsilon_m", 0.5);
+  EXPECT_EQ(value(config, "epsilon_m"), 0.5);
+  EXPECT_EQ(refused(config), "");
+  EXPECT_TRUE(Hears("the parameters have changed", rosgraph_msgs::Log::INFO));
+
+  config = set("/tuned_map", "epsilon_m", 0.0);
+  EXPECT_EQ(value(config, "epsilon_m"), 0.5);
+  EXPECT_NE(refused(config).find("epsilon_m"), std::string::npos) << refused(config);
+  EXPECT_TRUE(Hears("a change of the parameters is refused: "));
+  config = set("/tuned_map", "closure_min_distance_m", -0.5);
+  EXPECT_NE(refused(config).find("closure_min_distance_m: must not be negative"), std::string::npos) << refused(config);
+
+  // A wider near limit of the range leaves fewer points: the change has reached the core.
+  ASSERT_TRUE(Works(0, "lidar_i"));
+  config = set("/tuned", "min_range_m", 1000.0);
+  EXPECT_NE(refused(config).find("range_m"), std::string::npos) << refused(config);
+  config = set("/tuned", "local_radius_m", 1.0);
+  EXPECT_EQ(refused(config), "");
+  const std::size_t before = received_.size();
+  ASSERT_TRUE(Works(1, "lidar_i"));
+  ASSERT_GT(received_.size(), before);
+  EXPECT_FALSE(received_.back().retired.empty());
+}
+
 TEST_F(BadInput, RegisteredCloudsAreTakenBackIntoTheSensorsFrame) {
   ros::param::set("/registered/registered", true);
   ros::param::set("/registered/sensor_frame", "lidar_f");
   ros::param::set("/registered/base_frame", "");
   ASSERT_TRUE(LoadAndConnect("registered"));
+  PublishTf(0, "lidar_f");
   clouds_.publish(drive_->Cloud(0, "map"));
-  EXPECT_TRUE(Hears("registered clouds come in frame map, but odom_frame is odom"));
+  EXPECT_TRUE(
+      Hears("registered clouds come in frame map, but odom_frame is odom, and there is no tf from odom to map"));
 
   ASSERT_TRUE(LoadAndConnect("unregistered"));
   const auto centroids = [this](const std::string& name, int scan, bool is_registered) {

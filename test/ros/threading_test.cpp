@@ -82,7 +82,7 @@ constexpr StampNs kSecond = 1000000000;
 TEST(PoseBuffer, InterpolatesAndNeverGuesses) {
   PoseBuffer buffer(10.0, 0.5);
   EXPECT_FALSE(buffer.At(0));
-  EXPECT_NE(buffer.WhyNot(0).find("no odometry"), std::string::npos);
+  EXPECT_NE(buffer.WhyNot("odometry", 0).find("no odometry"), std::string::npos);
   buffer.Add(PoseAt(100 * kSecond, 1.0, 0.0));
   buffer.Add(PoseAt(100 * kSecond + kSecond / 4, 2.0, 0.4));
   buffer.Add(PoseAt(102 * kSecond, 9.0, 0.4));
@@ -93,11 +93,11 @@ TEST(PoseBuffer, InterpolatesAndNeverGuesses) {
   EXPECT_TRUE(buffer.At(100 * kSecond));
   EXPECT_TRUE(buffer.At(102 * kSecond));
   EXPECT_FALSE(buffer.At(101 * kSecond));
-  EXPECT_NE(buffer.WhyNot(101 * kSecond).find("gap"), std::string::npos);
+  EXPECT_NE(buffer.WhyNot("odometry", 101 * kSecond).find("gap"), std::string::npos);
   EXPECT_FALSE(buffer.At(99 * kSecond));
-  EXPECT_NE(buffer.WhyNot(99 * kSecond).find("begins"), std::string::npos);
+  EXPECT_NE(buffer.WhyNot("odometry", 99 * kSecond).find("begins"), std::string::npos);
   EXPECT_FALSE(buffer.At(103 * kSecond));
-  EXPECT_NE(buffer.WhyNot(103 * kSecond).find("ends"), std::string::npos);
+  EXPECT_NE(buffer.WhyNot("odometry", 103 * kSecond).find("ends"), std::string::npos);
 }
 
 TEST(PoseBuffer, StartsAnewWhenTimeJumpsBackAndForgetsTheOld) {
@@ -126,6 +126,13 @@ TEST(RobotSessions, NamesEverySessionOnce) {
   EXPECT_EQ(sessions.Find("alice", 9, 5).change, Change::kRewound);
   sessions.Clear();
   EXPECT_EQ(sessions.Find("alice", 9, 5).name, "alice");
+
+  // A session that was ended does not come back as another robot.
+  sessions.EndAll();
+  EXPECT_EQ(sessions.Find("alice", 9, 6).change, Change::kEnded);
+  EXPECT_EQ(sessions.Find("alice", 10, 7).change, Change::kNewRobot);
+  EXPECT_EQ(sessions.Find("alice", 10, 8).name, "alice");
+  EXPECT_EQ(sessions.Find("alice", 9, 8).change, Change::kEnded);
 }
 
 TEST(Throttle, LetsOneOfAKindThrough) {
