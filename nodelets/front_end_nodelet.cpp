@@ -25,7 +25,7 @@ constexpr std::uint32_t kCallbackQueue = 1000;  // roscpp drops without counting
 constexpr std::size_t kHistorySize = 600;
 constexpr double kLabelHeight_m = 0.5;           // over a segment's top
 constexpr double kLetter_m = 0.7;                // height of labels
-constexpr double kQuantisation = 0.1;            // of segment points, in voxels
+constexpr double kQuantisation = 0.02;           // of segment points, in voxels: 65 m fit into 16 bits at 2 mm
 constexpr double kCoarseFloatDistance_m = 10e3;  // from here on, registered float clouds are coarser than a millimetre
 
 bool HasFinitePoint(const Points& points) {
