@@ -60,7 +60,7 @@ LocateResult SensorLocator::Locate(const ros::Time& stamp, const std::string& se
   const TransformResult base_sensor = LookUp(base_frame, sensor_frame, stamp);
   if (!base_sensor.T_target_source)
     return {std::nullopt,
-            base_sensor.reason + " (base_frame may be empty where the robot has no other than " + sensor_frame + ")"};
+            base_sensor.reason + " (where the robot has no other frame, set base_frame to " + sensor_frame + ", too)"};
   const TransformResult odom_registered =
       LookUp(odom_frame, registered_frame.empty() ? odom_frame : registered_frame, stamp);
   if (!odom_registered.T_target_source)
