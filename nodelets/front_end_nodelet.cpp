@@ -32,6 +32,11 @@ bool HasFinitePoint(const Points& points) {
   return std::any_of(points.begin(), points.end(), [](const Eigen::Vector3f& p) { return p.allFinite(); });
 }
 
+/// Without a clock clouds are processed all the same, but whoever else follows ROS time waits for ever.
+bool IsClockMissing() {
+  return ros::Time::isSimTime() && ros::Time::now().isZero();
+}
+
 /// Topics on which others publish clouds now, as words.
 std::string CloudTopics() {
   ros::master::V_TopicInfo topics;
@@ -336,7 +341,7 @@ void FrontEndNodelet::Change(const FrontEndConfig& config) {
 
 /// In words, why nothing can come; empty if that is not known.
 std::string FrontEndNodelet::WhatIsMissing() const {
-  if (ros::Time::isSimTime() && ros::Time::now().isZero())
+  if (IsClockMissing())
     return "/use_sim_time is set, but nobody publishes /clock: play the bag with --clock, or unset it";
   if (cloud_subscriber_.getNumPublishers() == 0)
     return "nobody publishes " + cloud_subscriber_.getTopic() + "; " + CloudTopics();
@@ -345,11 +350,11 @@ std::string FrontEndNodelet::WhatIsMissing() const {
   return "";
 }
 
-/// A reminder in the log, as long as nothing has come at all.
+/// A reminder in the log, as long as nothing has come at all, or no clock.
 void FrontEndNodelet::SayWhatIsMissing() {
   {
     const std::lock_guard<std::mutex> lock(mutex_);
-    if (status_.processed > 0) return;
+    if (status_.processed > 0 && !IsClockMissing()) return;
   }
   if (!throttle_.IsDue("missing", kMissingPeriod_s)) return;
   const std::string missing = WhatIsMissing();
@@ -366,7 +371,7 @@ void FrontEndNodelet::Diagnose(diagnostic_updater::DiagnosticStatusWrapper& stat
   for (const auto& [kind, count] : status_.skipped) skipped += count;
   const double rate_hz = static_cast<double>(status_.processed - status_.reported_processed) / elapsed_s;
 
-  if (!missing.empty() && status_.received == status_.reported_received)
+  if (!missing.empty() && (status_.received == status_.reported_received || IsClockMissing()))
     status.summary(DiagnosticStatus::WARN, missing);
   else if (skipped != status_.reported_skipped)
     status.summary(DiagnosticStatus::WARN, "scans are skipped: " + status_.last_skip);
