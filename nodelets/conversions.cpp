@@ -9,6 +9,7 @@ namespace incremental_segmatch {
 namespace {
 
 constexpr double kInt16Max = std::numeric_limits<std::int16_t>::max();
+constexpr double kScanUnitM = 0.002;  // refinement is good to millimetres
 
 template <class Vector, class Quaternion>
 Pose MakePose(const Vector& translation, const Quaternion& rotation, const std::string& what) {
@@ -63,26 +64,29 @@ std::int16_t RoundToInt16(float value) {
   return static_cast<std::int16_t>(value + std::copysign(0.5f, value));
 }
 
-void QuantisePoints(const Points& points, double unit_m, Segment* message) {
+/// Multiples of a unit, which is `unit_m` or, where that is too small for the points' extent, larger; returned.
+float QuantisePoints(const Points& points, double unit_m, std::vector<std::int16_t>* quantised) {
   float largest = 0.f;
   for (const Eigen::Vector3f& p : points) largest = std::max(largest, p.cwiseAbs().maxCoeff());
-  message->point_unit_m = static_cast<float>(std::max(unit_m, largest / (kInt16Max - 1.0)));
-  const float scale = 1.f / message->point_unit_m;
-  message->points.resize(3 * points.size());
-  auto out = message->points.begin();
+  const float used_m = static_cast<float>(std::max(unit_m, largest / (kInt16Max - 1.0)));
+  const float scale = 1.f / used_m;
+  quantised->resize(3 * points.size());
+  auto out = quantised->begin();
   for (const Eigen::Vector3f& p : points)
     for (int axis = 0; axis < 3; ++axis) *out++ = RoundToInt16(p[axis] * scale);
+  return used_m;
 }
 
-std::shared_ptr<const Points> RestorePoints(const Segment& message) {
-  if (message.points.empty()) return nullptr;
-  if (message.points.size() % 3 != 0 || !(message.point_unit_m > 0.f))
-    throw std::invalid_argument("segment " + std::to_string(message.id) +
-                                ": points are no triples, or point_unit_m is not positive");
-  auto points = std::make_shared<Points>(message.points.size() / 3);
-  auto in = message.points.begin();
+/// Null where there are none. `what` and `unit_name` are for the error.
+std::shared_ptr<const Points> RestorePoints(const std::vector<std::int16_t>& quantised, float unit_m,
+                                            const std::string& what, const char* unit_name) {
+  if (quantised.empty()) return nullptr;
+  if (quantised.size() % 3 != 0 || !(unit_m > 0.f))
+    throw std::invalid_argument(what + ": points are no triples, or " + unit_name + " is not positive");
+  auto points = std::make_shared<Points>(quantised.size() / 3);
+  auto in = quantised.begin();
   for (Eigen::Vector3f& p : *points)
-    for (int axis = 0; axis < 3; ++axis) p[axis] = message.point_unit_m * static_cast<float>(*in++);
+    for (int axis = 0; axis < 3; ++axis) p[axis] = unit_m * static_cast<float>(*in++);
   return points;
 }
 
@@ -119,7 +123,8 @@ Segment ToSegment(const SegmentState& state, double point_unit_m, bool with_poin
   message.centroid = ToPoint(state.centroid_odom);
   message.descriptor.assign(state.descriptor.data(), state.descriptor.data() + state.descriptor.size());
   message.new_view = state.new_view;
-  if (with_points && state.points_centroid) QuantisePoints(*state.points_centroid, point_unit_m, &message);
+  if (with_points && state.points_centroid)
+    message.point_unit_m = QuantisePoints(*state.points_centroid, point_unit_m, &message.points);
   return message;
 }
 
@@ -131,7 +136,8 @@ SegmentState FromSegment(const Segment& message) {
   state.descriptor =
       Eigen::Map<const Descriptor>(message.descriptor.data(), static_cast<Eigen::Index>(message.descriptor.size()));
   state.new_view = message.new_view;
-  state.points_centroid = RestorePoints(message);
+  state.points_centroid =
+      RestorePoints(message.points, message.point_unit_m, "segment " + std::to_string(message.id), "point_unit_m");
   if (state.id == kNoSegment) throw std::invalid_argument("a segment has the ID 0, which means none");
   if (!state.centroid_odom.allFinite() || !state.descriptor.allFinite())
     throw std::invalid_argument("segment " + std::to_string(state.id) + ": centroid or descriptor is not finite");
@@ -223,6 +229,8 @@ SegmentArray ToSegmentArray(const SegmentDelta& delta, const RobotFrames& frames
   message.base_frame = frames.base_frame;
   message.sensor_in_base = ToPoseMsg(frames.T_base_sensor);
   message.changed.reserve(delta.changed.size());
+  if (with_points && delta.scan_sensor)
+    message.scan_unit_m = QuantisePoints(*delta.scan_sensor, kScanUnitM, &message.scan);
   for (const SegmentState& state : delta.changed)
     message.changed.push_back(ToSegment(state, point_unit_m, with_points));
   for (const RenamedSegment& renamed : delta.renamed) {
@@ -246,6 +254,7 @@ SegmentDelta ToSegmentDelta(const SegmentArray& message, const std::string& robo
   delta.T_odom_sensor = ToPose(message.sensor_pose, "sensor_pose");
   delta.T_odom_continuous = ToPose(message.continuous_frame, "continuous_frame");
   delta.full_state = message.full_state;
+  delta.scan_sensor = RestorePoints(message.scan, message.scan_unit_m, "the scan", "scan_unit_m");
   delta.changed.reserve(message.changed.size());
   for (const Segment& segment : message.changed) {
     if (!delta.changed.empty() && segment.id <= delta.changed.back().id)

@@ -18,9 +18,17 @@ void MeasureCoverage(const std::vector<Eigen::Vector3d>& centroids_local, const 
   }
 }
 
+bool HasRival(const Evidence& evidence, const AcceptanceParameters& parameters) {
+  return static_cast<double>(evidence.inliers) < parameters.min_ratio * static_cast<double>(evidence.runner_up);
+}
+
 Verdict Judge(const Evidence& evidence, const AcceptanceParameters& parameters) {
-  if (evidence.inliers < evidence.runner_up + parameters.min_margin) return Verdict::kAmbiguous;
+  if (HasRival(evidence, parameters) || evidence.since_twin_m < parameters.twin_memory_m) return Verdict::kAmbiguous;
   if (evidence.Coverage() < parameters.min_coverage) return Verdict::kUncovered;
+  if (evidence.contradiction > parameters.max_contradiction ||
+      evidence.contradiction_once > parameters.max_contradiction_once) {
+    return Verdict::kContradicted;
+  }
   if (evidence.sigma_m > parameters.max_sigma_m || evidence.sigma_rad > parameters.max_sigma_rad) return Verdict::kUncertain;
   if (evidence.distance_m > parameters.max_distance_m) return Verdict::kTooFar;
   return Verdict::kAccepted;
@@ -33,6 +41,12 @@ void Validate(const AcceptanceParameters& parameters) {
   require(parameters.support_distance_m > 0.0, "support_distance_m: must be positive");
   require(parameters.neighbourhood_m >= parameters.support_distance_m, "neighbourhood_m: must be at least support_distance_m");
   require(parameters.min_coverage >= 0.0 && parameters.min_coverage <= 1.0, "min_coverage: must be between 0 and 1");
+  require(parameters.max_contradiction >= 0.0 && parameters.max_contradiction <= 1.0, "max_contradiction: must be between 0 and 1");
+  require(parameters.max_contradiction_once >= 0.0 && parameters.max_contradiction_once <= 1.0,
+          "max_contradiction_once: must be between 0 and 1");
+  require(parameters.min_ratio >= 0.0, "min_ratio: must not be negative");
+  require(parameters.twin_size >= 1, "twin_size: must be at least 1");
+  require(parameters.twin_memory_m >= 0.0, "twin_memory_m: must not be negative");
   require(parameters.max_distance_m > 0.0, "max_distance_m: must be positive");
   require(parameters.max_sigma_m > 0.0, "max_sigma_m: must be positive");
   require(parameters.max_sigma_rad > 0.0, "max_sigma_rad: must be positive");

@@ -22,33 +22,22 @@ StepEnd ToStepEnd(RecognitionOutcome outcome) {
   return StepEnd::kTooFewCandidates;
 }
 
-/// The points within the radius of the center, or within the first multiple by two of it that holds enough of them.
-std::vector<Eigen::Vector3d> NearPoints(std::vector<Eigen::Vector3d> points, const Eigen::Vector3d& center,
-                                        const NearPointsParameters& parameters) {
-  for (double radius_m = parameters.radius_m;; radius_m *= 2.0) {
-    const auto is_near = [&](const Eigen::Vector3d& p) { return (p - center).squaredNorm() <= radius_m * radius_m; };
-    const std::size_t near = static_cast<std::size_t>(std::count_if(points.begin(), points.end(), is_near));
-    if (near < std::min(parameters.min_points, points.size())) continue;
-    points.erase(std::stable_partition(points.begin(), points.end(), is_near), points.end());
-    return points;
-  }
-}
-
 StepEnd ToStepEnd(Verdict verdict) {
   switch (verdict) {
     case Verdict::kAccepted: return StepEnd::kRecognized;
     case Verdict::kAmbiguous: return StepEnd::kAmbiguous;
     case Verdict::kUncovered: return StepEnd::kUncovered;
+    case Verdict::kContradicted: return StepEnd::kContradicted;
     case Verdict::kUncertain: return StepEnd::kUncertain;
     case Verdict::kTooFar: return StepEnd::kTooFar;
   }
   return StepEnd::kUncertain;
 }
 
-/// The part of a covariance of T_map_odom, perturbed on the left, that matters to the query sensor's pose in the target
-/// sensor's frame, perturbed on the right: T_target_query exp(xi) with xi = Ad(T_map_query^-1) xi_map.
-Covariance6 CovarianceAtQuery(const Covariance6& covariance_map, const Pose& T_map_query) {
-  const Pose inverse = T_map_query.inverse();
+/// A covariance of T_a_b perturbed on the left, exp(xi) T_a_b, as that of the perturbation on the right,
+/// T_a_b exp(Ad(T_a_b^-1) xi).
+Covariance6 PerturbedOnTheRight(const Covariance6& covariance_left, const Pose& T_a_b) {
+  const Pose inverse = T_a_b.inverse();
   const Eigen::Matrix3d R = inverse.linear();
   const Eigen::Vector3d t = inverse.translation();
   Eigen::Matrix3d t_cross;
@@ -57,7 +46,7 @@ Covariance6 CovarianceAtQuery(const Covariance6& covariance_map, const Pose& T_m
   adjoint.topLeftCorner<3, 3>() = R;
   adjoint.topRightCorner<3, 3>() = t_cross * R;
   adjoint.bottomRightCorner<3, 3>() = R;
-  const Covariance6 covariance = adjoint * covariance_map * adjoint.transpose();
+  const Covariance6 covariance = adjoint * covariance_left * adjoint.transpose();
   return 0.5 * (covariance + covariance.transpose());
 }
 
@@ -108,6 +97,7 @@ const char* ToString(StepEnd end) {
     case StepEnd::kTooYoung: return "too_young";
     case StepEnd::kAmbiguous: return "ambiguous";
     case StepEnd::kUncovered: return "uncovered";
+    case StepEnd::kContradicted: return "contradicted";
     case StepEnd::kUncertain: return "uncertain";
     case StepEnd::kTooFar: return "too_far";
   }
@@ -131,9 +121,18 @@ BackEnd::BackEnd(const BackEndParameters& parameters, TargetMap map, RecognizeFu
   if (!(matching.min_path_m >= 0.0)) throw std::invalid_argument("back_end.matching.min_path_m: must not be negative");
   if (!(matching.requery_distance >= 0.0))
     throw std::invalid_argument("back_end.matching.requery_distance: must not be negative");
+  if (!(parameters.keyframes.reach_m > 0.0)) throw std::invalid_argument("back_end.keyframes.reach_m: must be positive");
+  const HistoryParameters& history = parameters.history;
+  if (!(history.length_m >= 0.0)) throw std::invalid_argument("back_end.history.length_m: must not be negative");
+  if (!(history.spacing_m > 0.0)) throw std::invalid_argument("back_end.history.spacing_m: must be positive");
+  if (!(history.max_distance_m > 0.0)) throw std::invalid_argument("back_end.history.max_distance_m: must be positive");
+  if (!(history.drift >= 0.0)) throw std::invalid_argument("back_end.history.drift: must not be negative");
+  Validate(parameters.free_space);
   Validate(parameters.refinement);
   Validate(parameters.acceptance);
-  if (!(parameters.near_points.radius_m > 0.0)) throw std::invalid_argument("back_end.near_points.radius_m: must be positive");
+  if (!(parameters.keyframes.spacing_m > 0.0)) throw std::invalid_argument("back_end.keyframes.spacing_m: must be positive");
+  if (!(parameters.keyframes.submap_radius_m >= 0.0))
+    throw std::invalid_argument("back_end.keyframes.submap_radius_m: must not be negative");
   Recognizer{parameters.recognizer};  // refuses what it does not accept now, not at the first recognition
   for (RobotIndex robot = 0; robot < map_.robots(); ++robot) {
     robots_.emplace_back();
@@ -194,6 +193,10 @@ BackEndStep BackEnd::AttemptRecognition(RobotIndex robot, StageTimer timer) {
   step.counts.end = ToStepEnd(result.outcome);
   if (result.recognition) {
     std::optional<Closure> judged = Verify(robot, robots_[robot].stamp_ns, result, &step.counts);
+    if (judged && HasRival(judged->evidence, parameters_.acceptance) &&
+        judged->evidence.runner_up >= parameters_.acceptance.twin_size) {
+      robots_[robot].twin_path_m = robots_[robot].path_m;
+    }
     if (step.counts.end == StepEnd::kRecognized) {
       step.closure = std::move(judged);
       AcceptClosure(robot, *step.closure);
@@ -201,6 +204,8 @@ BackEndStep BackEnd::AttemptRecognition(RobotIndex robot, StageTimer timer) {
       step.refused = std::move(judged);
     }
   }
+  if (IsLoopClosure()) KeepKeyframe(robot, step.closure);
+  KeepHistory(robot);
   timer.Lap("refinement");
 
   step.times = timer.Take();
@@ -250,14 +255,17 @@ RobotIndex BackEnd::RobotByName(const std::string& name) {
 
 void BackEnd::ApplyDelta(const SegmentDelta& delta, RobotIndex index) {
   Robot& robot = robots_[index];
-  if (robot.started) robot.path_m += (robot.T_odom_sensor.inverse() * delta.T_odom_sensor).translation().norm();
+  if (robot.started) robot.path_m += (delta.T_odom_sensor.translation() - robot.T_odom_sensor.translation()).norm();
+  // No robot goes as far between two scans: it was carried, or its odometry started over.
+  if ((delta.T_odom_sensor.translation() - robot.T_odom_sensor.translation()).norm() > parameters_.history.spacing_m)
+    robot.history.clear();
   robot.started = true;
   robot.sequence = delta.sequence;
   robot.stamp_ns = delta.stamp_ns;
   robot.T_odom_sensor = delta.T_odom_sensor;
+  robot.scan_sensor = delta.scan_sensor;
   if (IsLoopClosure()) {
-    const std::uint32_t pose = map_.AddPose(index, delta.stamp_ns, delta.T_odom_sensor);
-    robot.path_at_pose_m.resize(pose + 1, robot.path_m);
+    map_.AddPose(index, delta.stamp_ns, delta.T_odom_sensor);
   }
   if (delta.full_state) {
     std::vector<RetiredSegment> lost;
@@ -319,15 +327,11 @@ void BackEnd::UpdateSegment(RobotIndex robot_index, const SegmentState& state, c
   segment.descriptor = state.descriptor;
   segment.last_seen_ns = delta.stamp_ns;
   segment.last_seen_path_m = robot.path_m;
-  if (state.points_centroid) {
-    segment.points_centroid = state.points_centroid;
-    segment.points_origin_odom = state.centroid_odom;
-  }
   if (!IsLoopClosure() || !state.new_view) return;
   const SegmentKey key{robot_index, state.id};
   SegmentView view;
   view.robot = robot_index;
-  view.pose = static_cast<std::uint32_t>(robot.path_at_pose_m.size() - 1);
+  view.pose = static_cast<std::uint32_t>(map_.Trajectory(robot_index).size() - 1);
   view.size = state.size;
   view.centroid_sensor = delta.T_odom_sensor.inverse() * state.centroid_odom;
   view.descriptor = state.descriptor;
@@ -433,37 +437,42 @@ const SegmentView& BackEnd::MatchedView(RobotIndex robot, const Correspondence& 
   throw std::logic_error("an inlier is none of the candidates");
 }
 
-/// Refines a recognition on points, gathers the evidence for it and judges that. `counts` gets the evidence and the end, which
-/// says whether what comes back is accepted.
+/// Refines a recognition on scans, gathers the evidence for it and judges that. `counts` gets the evidence and the end,
+/// which says whether what comes back is accepted.
 std::optional<Closure> BackEnd::Verify(RobotIndex robot, StampNs stamp_ns, const RecognizerResult& result,
-                                           BackEndCounts* counts) const {
-  Recognition recognition = *result.recognition;
+                                       BackEndCounts* counts) const {
+  const Recognition& recognition = *result.recognition;
+  const std::optional<KeyframeName> target = NearestKeyframe(robot, stamp_ns, recognition);
+  if (!target) {
+    counts->end = StepEnd::kTooYoung;
+    return std::nullopt;
+  }
+  Closure closure = MakeClosure(robot, stamp_ns, recognition, *target);
   Evidence evidence;
   evidence.inliers = recognition.inliers.size();
   evidence.runner_up = recognition.runner_up_size;
-  if (parameters_.refinement.enabled) {
-    const std::optional<RefinedTransform> refined = Refine(robot, recognition);
+  evidence.since_twin_m = robots_[robot].path_m - robots_[robot].twin_path_m;
+  if (parameters_.refinement.enabled && closure.T_target_query.translation().norm() <= parameters_.acceptance.max_distance_m) {
+    const std::optional<RefinedTransform> refined = Refine(robot, *target, closure.T_target_query);
     if (!refined) {
       counts->end = StepEnd::kNotRefined;
       return std::nullopt;
     }
-    recognition.T_target_local = refined->T_target_local;
-    recognition.covariance = refined->covariance;
+    closure.T_map_odom = closure.T_map_odom * robots_[robot].T_odom_sensor * closure.T_target_query.inverse() *
+                         refined->T_target_local * robots_[robot].T_odom_sensor.inverse();
+    closure.T_target_query = refined->T_target_local;
+    closure.covariance = PerturbedOnTheRight(refined->covariance, closure.T_target_query);
     evidence.overlap = refined->overlap;
   }
-  std::optional<Closure> closure = MakeClosure(robot, stamp_ns, recognition);
-  if (!closure) {
-    counts->end = StepEnd::kTooYoung;
-    return std::nullopt;
-  }
-  MeasureCoverage(robot, recognition.T_target_local, &evidence);
-  evidence.distance_m = closure->T_target_query.translation().norm();
-  evidence.sigma_m = LargestSigma(closure->covariance.topLeftCorner<3, 3>());
-  evidence.sigma_rad = LargestSigma(closure->covariance.bottomRightCorner<3, 3>());
+  MeasureCoverage(robot, closure.T_map_odom, &evidence);
+  MeasureContradiction(robot, *target, closure, &evidence);
+  evidence.distance_m = closure.T_target_query.translation().norm();
+  evidence.sigma_m = LargestSigma(closure.covariance.topLeftCorner<3, 3>());
+  evidence.sigma_rad = LargestSigma(closure.covariance.bottomRightCorner<3, 3>());
   counts->evidence = evidence;
   counts->end = ToStepEnd(Judge(evidence, parameters_.acceptance));
-  closure->candidates = result.candidates;
-  closure->evidence = evidence;
+  closure.candidates = result.candidates;
+  closure.evidence = evidence;
   return closure;
 }
 
@@ -484,58 +493,167 @@ void BackEnd::MeasureCoverage(RobotIndex robot, const Pose& T_map_odom, Evidence
   incremental_segmatch::MeasureCoverage(local, target, parameters_.acceptance, evidence);
 }
 
-std::optional<RefinedTransform> BackEnd::Refine(RobotIndex robot, const Recognition& recognition) const {
-  std::vector<Eigen::Vector3d> points_local, points_target;
-  for (const Correspondence& inlier : recognition.inliers) {
-    const LocalSegment& segment = robots_[robot].local.at(inlier.local.id);
-    const SegmentView& view = MatchedView(robot, inlier);
-    if (!segment.points_centroid || !view.points_centroid) continue;
-    for (const Eigen::Vector3f& p : *segment.points_centroid)
-      points_local.push_back(segment.points_origin_odom + p.cast<double>());
-    const TrajectoryPose& pose = map_.PoseOf(view);
-    const Eigen::Vector3d centroid_map = map_.CentroidMap(view);
-    const Eigen::Matrix3d R_map_odom = pose.T_map_sensor.linear() * pose.T_odom_sensor.linear().transpose();
-    for (const Eigen::Vector3f& p : *view.points_centroid)
-      points_target.push_back(centroid_map + R_map_odom * p.cast<double>());
-  }
-  return RefineOnPoints(NearPoints(std::move(points_local), robots_[robot].T_odom_sensor.translation(), parameters_.near_points),
-                        points_target, recognition.T_target_local, parameters_.refinement);
+const TrajectoryPose& BackEnd::PoseOf(const KeyframeName& keyframe) const {
+  return map_.Trajectory(keyframe.robot)[map_.Keyframes(keyframe.robot)[keyframe.index].pose];
 }
 
-/// The closure to the nearest of the poses that the matched views were seen from. None if all of them are too young.
-std::optional<Closure> BackEnd::MakeClosure(RobotIndex robot, StampNs stamp_ns, const Recognition& recognition) const {
-  const Pose T_map_query = recognition.T_target_local * robots_[robot].T_odom_sensor;
-  const SegmentView* nearest = nullptr;
-  double nearest_m = std::numeric_limits<double>::infinity();
+/// Of the key frames along the passes on which the matched segments were seen the one nearest to the recognised place: other
+/// passes may lie where they don't belong, until a correction. None if all of them are too young.
+std::optional<BackEnd::KeyframeName> BackEnd::NearestKeyframe(RobotIndex robot, StampNs stamp_ns,
+                                                              const Recognition& recognition) const {
+  std::map<RobotIndex, std::vector<double>> seen_from_m;  // path of the poses, by robot
   for (const Correspondence& inlier : recognition.inliers) {
     const SegmentView& view = MatchedView(robot, inlier);
-    const TrajectoryPose& pose = map_.PoseOf(view);
-    const bool own = view.robot == robot;
-    if (own && (static_cast<double>(stamp_ns - pose.stamp_ns) <= parameters_.matching.time_window_s * 1e9 ||
-                robots_[robot].path_m - robots_[robot].path_at_pose_m[view.pose] <= parameters_.matching.min_path_m))
-      continue;
-    const double distance_m = (pose.T_map_sensor.translation() - T_map_query.translation()).norm();
-    if (distance_m < nearest_m) {
-      nearest_m = distance_m;
-      nearest = &view;
+    seen_from_m[view.robot].push_back(map_.PoseOf(view).path_m);
+  }
+  const Eigen::Vector3d place = recognition.T_target_local * robots_[robot].T_odom_sensor.translation();
+  std::optional<KeyframeName> nearest;
+  double nearest2 = std::numeric_limits<double>::infinity();
+  for (auto& [other, paths_m] : seen_from_m) {
+    std::sort(paths_m.begin(), paths_m.end());
+    for (std::size_t i = 0; i < map_.Keyframes(other).size(); ++i) {
+      const KeyframeName keyframe{other, i};
+      const TrajectoryPose& pose = PoseOf(keyframe);
+      const double distance2 = (pose.T_map_sensor.translation() - place).squaredNorm();
+      if (distance2 >= nearest2) continue;
+      const auto next = std::lower_bound(paths_m.begin(), paths_m.end(), pose.path_m - parameters_.keyframes.reach_m);
+      if (next == paths_m.end() || *next > pose.path_m + parameters_.keyframes.reach_m) continue;
+      if (other == robot && IsYoung(robot, stamp_ns, map_.Keyframes(other)[i].pose)) continue;
+      nearest2 = distance2;
+      nearest = keyframe;
     }
   }
-  if (nearest == nullptr) return std::nullopt;
+  return nearest;
+}
 
-  const TrajectoryPose& target = map_.PoseOf(*nearest);
+/// Of the key frames of one pass, within so much of path around one of them, the nearest to a place, if it is near enough.
+std::optional<BackEnd::KeyframeName> BackEnd::NearestKeyframeAlong(const KeyframeName& around, double along_m,
+                                                                   const Eigen::Vector3d& place) const {
+  const double path_m = PoseOf(around).path_m;
+  std::optional<KeyframeName> nearest;
+  double nearest2 = parameters_.history.max_distance_m * parameters_.history.max_distance_m;
+  const auto consider = [&](std::size_t index) {
+    const TrajectoryPose& pose = PoseOf({around.robot, index});
+    if (std::abs(pose.path_m - path_m) > along_m) return false;
+    const double distance2 = (pose.T_map_sensor.translation() - place).squaredNorm();
+    if (distance2 < nearest2) {
+      nearest2 = distance2;
+      nearest = KeyframeName{around.robot, index};
+    }
+    return true;
+  };
+  for (std::size_t i = around.index; i < map_.Keyframes(around.robot).size() && consider(i); ++i) {
+  }
+  for (std::size_t i = around.index; i > 0 && consider(i - 1); --i) {
+  }
+  return nearest;
+}
+
+/// Holds the key frames around the place, and along the way to it, against what the robot's scans saw there.
+void BackEnd::MeasureContradiction(RobotIndex index, const KeyframeName& target, const Closure& closure,
+                                   Evidence* evidence) const {
+  constexpr std::size_t kMinJudged = 50;  // points, for a share to mean something
+  const Robot& robot = robots_[index];
+  const Points* scan_target = map_.Keyframes(target.robot)[target.index].scan_sensor.get();
+  if (!robot.scan_sensor || scan_target == nullptr) return;
+  FreeSpaceCounts all;
+  const auto compare = [&](const RangeImage& image, const Points& points, const Pose& T_image_points, double slack_m) {
+    const FreeSpaceCounts counts = image.Compare(points, T_image_points, slack_m, parameters_.free_space);
+    all += counts;
+    if (counts.confirmed + counts.seen_through >= kMinJudged)
+      evidence->contradiction_once = std::max(evidence->contradiction_once, counts.Contradiction());
+  };
+  compare(RangeImage(*robot.scan_sensor), *scan_target, closure.T_target_query.inverse(), 0.0);
+  for (const PastScan& past : robot.history) {
+    const double back_m = robot.path_m - past.path_m;
+    const Pose T_map_past = closure.T_map_odom * past.T_odom_sensor;
+    const std::optional<KeyframeName> there =
+        NearestKeyframeAlong(target, back_m + parameters_.keyframes.reach_m, T_map_past.translation());
+    if (!there) continue;
+    const Points* scan_there = map_.Keyframes(there->robot)[there->index].scan_sensor.get();
+    if (scan_there == nullptr) continue;
+    // Both visits have drifted on the way between there and here.
+    compare(past.image, *scan_there, T_map_past.inverse() * PoseOf(*there).T_map_sensor,
+            2.0 * parameters_.history.drift * back_m);
+  }
+  evidence->contradiction = all.confirmed + all.seen_through >= kMinJudged ? all.Contradiction() : 0.0;
+}
+
+/// Keeps this step's scan for the history if the robot went far enough, and forgets what is too far back.
+void BackEnd::KeepHistory(RobotIndex index) {
+  Robot& robot = robots_[index];
+  while (!robot.history.empty() && robot.path_m - robot.history.front().path_m > parameters_.history.length_m)
+    robot.history.pop_front();
+  if (!robot.scan_sensor) return;
+  if (!robot.history.empty() && robot.path_m - robot.history.back().path_m < parameters_.history.spacing_m) return;
+  robot.history.push_back({robot.T_odom_sensor, robot.path_m, RangeImage(*robot.scan_sensor)});
+}
+
+/// Whether a robot was at a pose of its trajectory too recently, in time or in path, for a closure.
+bool BackEnd::IsYoung(RobotIndex robot, StampNs now_ns, std::uint32_t pose) const {
+  const double age_s = static_cast<double>(now_ns - map_.Trajectory(robot)[pose].stamp_ns) / 1e9;
+  return age_s <= parameters_.matching.time_window_s ||
+         robots_[robot].path_m - map_.Trajectory(robot)[pose].path_m <= parameters_.matching.min_path_m;
+}
+
+/// The scan that made the recognition against those around the key frame: neither has drifted, as the local map and the
+/// segments that were gathered along the way have.
+std::optional<RefinedTransform> BackEnd::Refine(RobotIndex robot, const KeyframeName& target,
+                                                const Pose& T_target_query) const {
+  if (!robots_[robot].scan_sensor) return std::nullopt;
+  std::vector<Eigen::Vector3d> points_query;
+  points_query.reserve(robots_[robot].scan_sensor->size());
+  for (const Eigen::Vector3f& p : *robots_[robot].scan_sensor) points_query.push_back(p.cast<double>());
+  return RefineOnPoints(points_query, Submap(target), T_target_query, parameters_.refinement);
+}
+
+/// Scans of a key frame and of its neighbours along the trajectory, in its sensor's frame. Odometry joins them.
+std::vector<Eigen::Vector3d> BackEnd::Submap(const KeyframeName& center) const {
+  const std::vector<Keyframe>& keyframes = map_.Keyframes(center.robot);
+  const Pose T_center_odom = PoseOf(center).T_odom_sensor.inverse();
+  std::vector<Eigen::Vector3d> points;
+  const auto add = [&](std::size_t index) {
+    const Pose T_center_sensor = T_center_odom * PoseOf({center.robot, index}).T_odom_sensor;
+    if (T_center_sensor.translation().norm() > parameters_.keyframes.submap_radius_m) return false;
+    if (keyframes[index].scan_sensor)
+      for (const Eigen::Vector3f& p : *keyframes[index].scan_sensor) points.push_back(T_center_sensor * p.cast<double>());
+    return true;
+  };
+  for (std::size_t i = center.index; i < keyframes.size() && add(i); ++i) {
+  }
+  for (std::size_t i = center.index; i > 0 && add(i - 1); --i) {
+  }
+  return points;
+}
+
+/// The closure between the query's sensor and a key frame's, as the segments' centroids have it.
+Closure BackEnd::MakeClosure(RobotIndex robot, StampNs stamp_ns, const Recognition& recognition,
+                             const KeyframeName& keyframe) const {
+  const TrajectoryPose& target = PoseOf(keyframe);
+  const Pose T_map_query = recognition.T_target_local * robots_[robot].T_odom_sensor;
   Closure closure;
   closure.stamp_query_ns = stamp_ns;
   closure.stamp_target_ns = target.stamp_ns;
   closure.robot_query = robots_[robot].name;
-  closure.robot_target = map_.RobotName(nearest->robot);
+  closure.robot_target = map_.RobotName(keyframe.robot);
   closure.T_target_query = target.T_map_sensor.inverse() * T_map_query;
-  closure.covariance = CovarianceAtQuery(recognition.covariance, T_map_query);
+  closure.covariance = PerturbedOnTheRight(recognition.covariance, T_map_query);
   closure.inliers = recognition.inliers.size();
   closure.rms_m = recognition.rms_m;
   closure.T_map_odom = recognition.T_target_local;
   for (const Correspondence& c : recognition.inliers)
     closure.matches.push_back({c.local, c.target, c.centroid_local, c.centroid_target, c.descriptor_distance});
   return closure;
+}
+
+/// Keeps this step's scan if the robot went far enough since the last key frame, and is not where one is already.
+void BackEnd::KeepKeyframe(RobotIndex index, const std::optional<Closure>& closure) {
+  Robot& robot = robots_[index];
+  const double spacing_m = parameters_.keyframes.spacing_m;
+  if (robot.path_m - robot.keyframe_path_m < spacing_m) return;
+  if (closure && closure->T_target_query.translation().norm() < spacing_m) return;
+  map_.AddKeyframe(index, robot.scan_sensor);
+  robot.keyframe_path_m = robot.path_m;
 }
 
 /// What was recognised is the same: remembered until the local segment's tracking ends.

@@ -37,6 +37,7 @@ FrontEnd::FrontEnd(const FrontEndParameters& parameters, std::string robot)
       segmenter_(MakeSegmenter(parameters, grid_, normals_.get())),
       describer_(parameters.descriptor, parameters.grid.resolution_m) {
   Validate(parameters.local_radius_m, parameters.view);
+  Validate(parameters.thinning);
 }
 
 void FrontEnd::ChangeParameters(const GroundFilterParameters& ground, double local_radius_m,
@@ -86,6 +87,9 @@ FrontEndStep FrontEnd::Process(const Scan& scan) {
 
   step.delta = DescribeChanges(left_segments, grown_segments);
   timer.Lap("description");
+
+  step.delta.scan_sensor = std::make_shared<const Points>(ThinScan(scan.points_sensor, parameters_.thinning));
+  timer.Lap("scan_thinning");
 
   step.times = timer.Take();
   step.counts.points = scan.points_sensor.size();

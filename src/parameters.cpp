@@ -321,6 +321,12 @@ const std::vector<Parameter>& Table() {
       NUMBER(front_end.view.baseline_m, Above(0),
              "or once it changed and the sensor is this far from where its last view was taken"),
 
+      NUMBER(front_end.thinning.cell_size_m, Above(0),
+             "of each scan one point of every cubic cell of this side goes along, for refinement"),
+      NUMBER(front_end.thinning.min_range_m, AtLeast(0), "points nearer than this horizontally don't"),
+      NUMBER(front_end.thinning.max_range_m, Above(0), "nor those farther away; more than `min_range_m`"),
+      NUMBER(front_end.thinning.max_points, AtLeast(1), "so many points of a scan are looked at"),
+
       CHOICE(back_end.mode,
              "the target map is what the robots of this run have seen so far; or it is loaded and fixed"),
 
@@ -343,6 +349,8 @@ const std::vector<Parameter>& Table() {
              "floor of a centroid's standard deviation per axis in the covariance"),
       CHOICE(back_end.recognizer.find_runner_up,
              "also look for the best clique beside the winner: evidence against ambiguity"),
+      NUMBER(back_end.recognizer.same_place_m, AtLeast(0),
+             "correspondences that fit the recognised transform so well are no rivals of it"),
       Number(
           "back_end.recognizer.runner_up_deadline_us",
           [](auto& p) -> auto& { return p.back_end.recognizer.runner_up_deadline; }, AtLeast(1), "of that search"),
@@ -370,13 +378,26 @@ const std::vector<Parameter>& Table() {
       NUMBER(back_end.recognizer.clique.max_tie_work, AtLeast(0),
              "effort of looking for further maximum sets, in 64-bit words touched: a count, so that results repeat"),
 
-      NUMBER(back_end.near_points.radius_m, Above(0),
-             "points of the matched segments so near to the sensor refine a recognition, if they are enough"),
-      NUMBER(back_end.near_points.min_points, AtLeast(0),
-             "if not, the radius is doubled until they are, or all are in"),
+      NUMBER(back_end.keyframes.spacing_m, Above(0), "path between key frames, whose scans are kept"),
+      NUMBER(back_end.keyframes.submap_radius_m, AtLeast(0),
+             "a recognition is refined on the scans of the key frame nearest to it and of those so near to that one"),
+
+      NUMBER(back_end.keyframes.reach_m, Above(0),
+             "path between the key frame of a closure and the poses that matched segments were seen from, at most"),
+
+      NUMBER(back_end.history.length_m, AtLeast(0), "so much of path behind the robot speaks for or against a place"),
+      NUMBER(back_end.history.spacing_m, Above(0), "path between the scans of it that are kept"),
+      NUMBER(back_end.history.max_distance_m, Above(0), "they are held against key frames this near"),
+      NUMBER(back_end.history.drift, AtLeast(0), "metres by which odometry may have drifted per metre of path"),
+
+      NUMBER(back_end.free_space.min_height_m, Finite(),
+             "lower points are not held against scans: cars come and go; in the sensor's frame"),
+      NUMBER(back_end.free_space.max_range_m, Above(0), "nor are those farther from the sensor"),
+      NUMBER(back_end.free_space.tolerance_m, Above(0),
+             "a return this near to a point confirms it; where all are farther by twice as much, it is seen through"),
 
       CHOICE(back_end.refinement.enabled,
-             "refine a recognition on the points of its matched segments, and refuse it if that fails"),
+             "refine a recognition on the scans of both visits, and refuse it if that fails"),
       NUMBER(back_end.refinement.max_distance_m, Above(0),
              "of a point to its partner, in the first iteration; at least `min_distance_m`"),
       NUMBER(back_end.refinement.min_distance_m, Above(0), "the same in the last iteration"),
@@ -397,10 +418,16 @@ const std::vector<Parameter>& Table() {
              "and is expected to be, where any target segment is this near; at least `support_distance_m`"),
       NUMBER(back_end.acceptance.min_coverage, Between(0, 1),
              "least share of the expected local segments that are supported"),
-      NUMBER(back_end.acceptance.min_margin, AtLeast(0),
-             "inliers must outnumber the best clique beside them by so many"),
+      NUMBER(back_end.acceptance.min_ratio, AtLeast(0),
+             "the best clique that speaks for another place must be so many times smaller"),
+      NUMBER(back_end.acceptance.twin_size, AtLeast(1),
+             "a clique so large that speaks for another place, and makes this one ambiguous, shows that there are twins"),
+      NUMBER(back_end.acceptance.twin_memory_m, AtLeast(0), "for so much of path after twins nothing is accepted"),
       NUMBER(back_end.acceptance.max_distance_m, Above(0),
              "of the query from the pose its target was seen from: odometry drifts in between"),
+      NUMBER(back_end.acceptance.max_contradiction, Between(0, 1),
+             "share of what the map has along the way to the place that the robot's scans see through"),
+      NUMBER(back_end.acceptance.max_contradiction_once, Between(0, 1), "the same of any single scan"),
       NUMBER(back_end.acceptance.max_sigma_m, Above(0), "largest standard deviation of the query's position"),
       NUMBER(back_end.acceptance.max_sigma_rad, Above(0), "the same of its orientation"),
 
@@ -434,6 +461,8 @@ const std::vector<Relation>& Relations() {
          const GroundFilterParameters& ground = p.front_end.ground;
          return ground.model != GroundModel::kElevation || std::ceil(ground.max_range_m / ground.cell_size_m) <= 1000.0;
        }},
+      {"front_end.thinning.max_range_m", "must be more than min_range_m",
+       [](const Parameters& p) { return p.front_end.thinning.max_range_m > p.front_end.thinning.min_range_m; }},
       {"front_end.segmenter.growing_radius_m", "must be at most 16 * grid.resolution_m",
        [](const Parameters& p) {
          return p.front_end.segmenter.growing_radius_m <= 16.0 * p.front_end.grid.resolution_m;

@@ -153,12 +153,24 @@ ConsistencyGraph Without(const ConsistencyGraph& graph, const Vertices& removed)
   return rest;
 }
 
-std::size_t RunnerUpSize(const ConsistencyGraph& graph, const Vertices& winner, std::chrono::microseconds deadline) {
+/// The correspondences that fit the transform: a further sighting of an inlier's object is no rival of it.
+Vertices Fitting(const Correspondences& correspondences, const Pose& T_target_local, double distance_m) {
+  Vertices fitting;
+  for (std::uint32_t v = 0; v < correspondences.size(); ++v) {
+    const Correspondence& c = correspondences[v];
+    if ((T_target_local * c.centroid_local - c.centroid_target).norm() <= distance_m) fitting.push_back(v);
+  }
+  return fitting;
+}
+
+/// Size of the largest clique among the rest, if it is at least half as large as the winner.
+std::size_t RunnerUpSize(const ConsistencyGraph& graph, std::size_t winner_size, const Vertices& fitting,
+                         std::chrono::microseconds deadline) {
   MaxCliqueParameters parameters;
-  parameters.min_size = std::max<std::size_t>(3, (winner.size() + 1) / 2);
+  parameters.min_size = std::max<std::size_t>(3, (winner_size + 1) / 2);
   parameters.deadline = deadline;
   parameters.max_ties = 1;
-  return FindMaxClique(Without(graph, winner), parameters).vertices.size();
+  return FindMaxClique(Without(graph, fitting), parameters).vertices.size();
 }
 
 void Validate(const RecognizerParameters& parameters) {
@@ -175,6 +187,7 @@ void Validate(const RecognizerParameters& parameters) {
   require(parameters.max_rms_m > 0.0, "max_rms_m must be positive");
   require(parameters.min_spread_m > 0.0, "min_spread_m must be positive");
   require(parameters.min_sigma_m > 0.0, "min_sigma_m must be positive");
+  require(parameters.same_place_m >= 0.0, "same_place_m must not be negative");
   require(parameters.runner_up_deadline.count() > 0, "runner_up_deadline must be positive");
 }
 
@@ -254,7 +267,10 @@ RecognizerResult Recognizer::Recognize(const Correspondences& correspondences) {
 
   if (parameters_.find_runner_up) {
     const Clock::time_point runner_up_start = Clock::now();
-    recognition.runner_up_size = RunnerUpSize(graph, clique.vertices, parameters_.runner_up_deadline);
+    Vertices fitting = Fitting(sorted, recognition.T_target_local, parameters_.same_place_m);
+    fitting.insert(fitting.end(), clique.vertices.begin(), clique.vertices.end());
+    recognition.runner_up_size =
+        RunnerUpSize(graph, clique.vertices.size(), fitting, parameters_.runner_up_deadline);
     result.clique_ms += MillisecondsSince(runner_up_start);
   }
   result.outcome = RecognitionOutcome::kAccepted;

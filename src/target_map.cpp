@@ -37,7 +37,7 @@ TargetMap::TargetMap(const TargetMapParameters& parameters) : parameters_(parame
 RobotIndex TargetMap::RobotByName(const std::string& name) {
   const auto it = std::find_if(robots_.begin(), robots_.end(), [&](const Robot& robot) { return robot.name == name; });
   const auto index = static_cast<RobotIndex>(it - robots_.begin());
-  if (it == robots_.end()) robots_.push_back({name, {}, Pose::Identity()});
+  if (it == robots_.end()) robots_.push_back({name, {}, Pose::Identity(), {}});
   return index;
 }
 
@@ -51,8 +51,18 @@ std::uint32_t TargetMap::AddPose(RobotIndex robot_index, StampNs stamp_ns, const
                                 std::to_string(stamp_ns) + " ns follows " +
                                 std::to_string(robot.trajectory.back().stamp_ns) + " ns");
   }
-  robot.trajectory.push_back({stamp_ns, T_odom_sensor, robot.T_map_odom * T_odom_sensor});
+  const double path_m = robot.trajectory.empty() ? 0.0 : PathAfter(robot.trajectory.back(), T_odom_sensor);
+  robot.trajectory.push_back({stamp_ns, T_odom_sensor, robot.T_map_odom * T_odom_sensor, path_m});
   return static_cast<std::uint32_t>(robot.trajectory.size() - 1);
+}
+
+void TargetMap::AddKeyframe(RobotIndex robot_index, std::shared_ptr<const Points> scan_sensor) {
+  Robot& robot = robots_.at(robot_index);
+  const std::size_t known = robot.keyframes.empty() ? 0 : robot.keyframes.back().pose + 1;
+  if (robot.trajectory.size() <= known) {
+    throw std::invalid_argument("target map: robot '" + robot.name + "' has no pose that is newer than its last key frame");
+  }
+  robot.keyframes.push_back({static_cast<std::uint32_t>(robot.trajectory.size() - 1), std::move(scan_sensor)});
 }
 
 void TargetMap::CorrectTrajectory(RobotIndex robot_index, const std::vector<StampedPose>& T_map_sensor) {
@@ -147,7 +157,11 @@ Eigen::Vector3d TargetMap::CentroidMap(const SegmentView& view) const {
 std::size_t TargetMap::memory_bytes() const {
   constexpr std::size_t kTreeNodeOverhead = 4 * sizeof(void*);
   std::size_t bytes = sizeof(*this) + robots_.capacity() * sizeof(Robot);
-  for (const Robot& robot : robots_) bytes += robot.trajectory.capacity() * sizeof(TrajectoryPose);
+  for (const Robot& robot : robots_) {
+    bytes += robot.trajectory.capacity() * sizeof(TrajectoryPose) + robot.keyframes.capacity() * sizeof(Keyframe);
+    for (const Keyframe& keyframe : robot.keyframes)
+      if (keyframe.scan_sensor) bytes += keyframe.scan_sensor->capacity() * sizeof(Eigen::Vector3f);
+  }
   for (const auto& entry : segments_) {
     bytes += sizeof(entry) + kTreeNodeOverhead + entry.second.views.capacity() * sizeof(SegmentView);
     for (const SegmentView& view : entry.second.views) {

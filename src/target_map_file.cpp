@@ -1,6 +1,6 @@
 // The file of a target map. Little-endian throughout:
 //   magic (8 bytes), version (u32), CRC-32 of the content (u32), size of the content in bytes (u64), content.
-// The content is a list of robots with their trajectories, then a list of segments with their views, bit for bit as
+// The content is a list of robots with their trajectories and key frames, then a list of segments with their views, bit for bit as
 // they are in memory, so that a loaded map recognises exactly as before.
 
 #include <fcntl.h>
@@ -23,7 +23,7 @@ namespace incremental_segmatch {
 namespace {
 
 constexpr char kMagic[8] = {'S', 'E', 'G', 'M', 'A', 'P', '\r', '\n'};
-constexpr std::uint32_t kVersion = 1;
+constexpr std::uint32_t kVersion = 2;
 constexpr std::size_t kHeaderSize = 24;
 constexpr std::size_t kBufferSize = 1 << 20;
 
@@ -183,6 +183,18 @@ void PutPose(const Pose& pose, AtomicFile* file) {
     for (int column = 0; column < 4; ++column) file->Put(pose(row, column));
 }
 
+/// Points that may be missing.
+void PutPoints(const Points* points, AtomicFile* file) {
+  file->Put(static_cast<std::uint8_t>(points != nullptr));
+  if (points == nullptr) return;
+  file->Put(static_cast<std::uint64_t>(points->size()));
+  std::vector<unsigned char> bytes(3 * sizeof(float) * points->size());
+  unsigned char* at = bytes.data();
+  for (const Eigen::Vector3f& point : *points)
+    for (int axis = 0; axis < 3; ++axis, at += sizeof(float)) PutLittleEndian(point[axis], at);
+  file->PutBytes(bytes.data(), bytes.size());
+}
+
 void PutView(const SegmentView& view, AtomicFile* file) {
   file->Put(view.robot);
   file->Put(view.pose);
@@ -190,14 +202,7 @@ void PutView(const SegmentView& view, AtomicFile* file) {
   for (int axis = 0; axis < 3; ++axis) file->Put(view.centroid_sensor[axis]);
   file->Put(static_cast<std::uint64_t>(view.descriptor.size()));
   for (const float value : view.descriptor) file->Put(value);
-  file->Put(static_cast<std::uint8_t>(view.points_centroid != nullptr));
-  if (view.points_centroid == nullptr) return;
-  file->Put(static_cast<std::uint64_t>(view.points_centroid->size()));
-  std::vector<unsigned char> bytes(3 * sizeof(float) * view.points_centroid->size());
-  unsigned char* at = bytes.data();
-  for (const Eigen::Vector3f& point : *view.points_centroid)
-    for (int axis = 0; axis < 3; ++axis, at += sizeof(float)) PutLittleEndian(point[axis], at);
-  file->PutBytes(bytes.data(), bytes.size());
+  PutPoints(view.points_centroid.get(), file);
 }
 
 // ---- Reading --------------------------------------------------------------------------------------------------------
@@ -237,6 +242,8 @@ void RequireWhole(const std::vector<unsigned char>& bytes, const std::string& pa
     fail(" is of version " + std::to_string(version) + ", and this program knows none newer than version " +
          std::to_string(kVersion) + ": load it with a newer program, or save it with one as old as this");
   if (version == 0) fail(" is damaged: there is no version 0");
+  if (version < kVersion)
+    fail(" is of version " + std::to_string(version) + ", whose maps have no key frames: make it anew");
   const auto content_size = GetLittleEndian<std::uint64_t>(bytes.data() + 16);
   const std::uint64_t present = bytes.size() - kHeaderSize;
   if (present != content_size)
@@ -292,6 +299,17 @@ Pose GetPose(Reader* reader) {
   return pose;
 }
 
+std::shared_ptr<const Points> GetPoints(Reader* reader) {
+  const auto has_points = reader->Get<std::uint8_t>();
+  reader->Require(has_points <= 1, "a flag is neither 0 nor 1");
+  if (has_points == 0) return nullptr;
+  Points points(reader->GetCount(3 * sizeof(float)));
+  const unsigned char* at = reader->Take(points.size(), 3 * sizeof(float));
+  for (Eigen::Vector3f& point : points)
+    for (int axis = 0; axis < 3; ++axis, at += sizeof(float)) point[axis] = GetLittleEndian<float>(at);
+  return std::make_shared<const Points>(std::move(points));
+}
+
 SegmentView GetView(Reader* reader) {
   SegmentView view;
   view.robot = reader->Get<std::uint32_t>();
@@ -300,14 +318,7 @@ SegmentView GetView(Reader* reader) {
   for (int axis = 0; axis < 3; ++axis) view.centroid_sensor[axis] = reader->Get<double>();
   view.descriptor.resize(static_cast<Eigen::Index>(reader->GetCount(sizeof(float))));
   for (float& value : view.descriptor) value = reader->Get<float>();
-  const auto has_points = reader->Get<std::uint8_t>();
-  reader->Require(has_points <= 1, "a flag is neither 0 nor 1");
-  if (has_points == 0) return view;
-  Points points(reader->GetCount(3 * sizeof(float)));
-  const unsigned char* at = reader->Take(points.size(), 3 * sizeof(float));
-  for (Eigen::Vector3f& point : points)
-    for (int axis = 0; axis < 3; ++axis, at += sizeof(float)) point[axis] = GetLittleEndian<float>(at);
-  view.points_centroid = std::make_shared<const Points>(std::move(points));
+  view.points_centroid = GetPoints(reader);
   return view;
 }
 
@@ -326,6 +337,11 @@ void TargetMap::Save(const std::string& path) const {
       PutPose(pose.T_odom_sensor, &file);
       PutPose(pose.T_map_sensor, &file);
     }
+    file.Put(static_cast<std::uint64_t>(robot.keyframes.size()));
+    for (const Keyframe& keyframe : robot.keyframes) {
+      file.Put(keyframe.pose);
+      PutPoints(keyframe.scan_sensor.get(), &file);
+    }
   }
   file.Put(static_cast<std::uint64_t>(segments_.size()));
   for (const auto& [key, segment] : segments_) {
@@ -341,7 +357,7 @@ void TargetMap::Save(const std::string& path) const {
 TargetMap TargetMap::Load(const std::string& path, const TargetMapParameters& parameters) {
   // Least bytes of an element of each list: what is refused here can't make a damaged count allocate more than the
   // file's size.
-  constexpr std::size_t kPose = 12 * 8, kRobot = 8 + kPose + 8, kSegment = 4 + 4 + 8 + 8, kView = 3 * 4 + 3 * 8 + 8 + 1;
+  constexpr std::size_t kPose = 12 * 8, kRobot = 8 + kPose + 8 + 8, kKeyframe = 4 + 1, kSegment = 4 + 4 + 8 + 8, kView = 3 * 4 + 3 * 8 + 8 + 1;
   TargetMap map(parameters);
   const std::vector<unsigned char> bytes = ReadFile(path);
   RequireWhole(bytes, path);
@@ -362,7 +378,17 @@ TargetMap TargetMap::Load(const std::string& path, const TargetMapParameters& pa
       pose.T_map_sensor = GetPose(&reader);
       reader.Require(previous == nullptr || previous->stamp_ns < pose.stamp_ns,
                      "stamps of a trajectory do not increase");
+      if (previous != nullptr) pose.path_m = PathAfter(*previous, pose.T_odom_sensor);
       previous = &pose;
+    }
+    robot.keyframes.resize(reader.GetCount(kKeyframe));
+    std::uint64_t next_pose = 0;
+    for (Keyframe& keyframe : robot.keyframes) {
+      keyframe.pose = reader.Get<std::uint32_t>();
+      reader.Require(keyframe.pose >= next_pose && keyframe.pose < robot.trajectory.size(),
+                     "a key frame is no later pose of its trajectory");
+      next_pose = std::uint64_t{keyframe.pose} + 1;
+      keyframe.scan_sensor = GetPoints(&reader);
     }
   }
 

@@ -4,6 +4,7 @@
 
 #include <Eigen/Core>
 #include <cstddef>
+#include <limits>
 #include <vector>
 
 #include "incremental_segmatch/recognizer.hpp"
@@ -17,16 +18,23 @@ struct AcceptanceParameters {
   double neighbourhood_m =
       10.0;                    ///< and is expected to be, where any target segment is this near: the map was seen there
   double min_coverage = 0.25;  ///< least share of the expected local segments that are supported
-  std::size_t min_margin = 1;  ///< inliers must outnumber the best clique beside them by so many
+  double min_ratio = 1.75;     ///< of the inliers to the best clique that speaks for another place
+  /// A rival of at least so many matches that makes a place ambiguous is no chance: there are twins hereabouts, and for
+  /// some way nothing is accepted, though some steps may see no rival.
+  std::size_t twin_size = 12;
+  double twin_memory_m = 100.0;  ///< the way
   double max_distance_m = 20.0;  ///< of the query from the pose its target was seen from: odometry drifts in between
   double max_sigma_m = 0.5;      ///< largest standard deviation of the query's position, along its worst axis
   double max_sigma_rad = 0.02;   ///< the same of its orientation
+  double max_contradiction = 0.03;        ///< share of what the map has there that the scans see through, over all
+  double max_contradiction_once = 0.1;    ///< and in any one of the scans
 };
 
 /// What speaks for and against a recognition.
 struct Evidence {
   std::size_t inliers = 0;    ///< matches that agree
-  std::size_t runner_up = 0;  ///< size of the best clique that shares no correspondence with the inliers
+  std::size_t runner_up = 0;  ///< size of the best clique that speaks for another place
+  double since_twin_m = std::numeric_limits<double>::infinity();  ///< path since a place had a twin
   std::size_t expected = 0;   ///< local segments where the map was seen
   std::size_t supported = 0;  ///< of them, those with a target segment in their place
   double overlap =
@@ -34,6 +42,8 @@ struct Evidence {
   double sigma_m = 0.0;    ///< standard deviation of the query's position, along its worst axis
   double sigma_rad = 0.0;  ///< and of its orientation
 
+  double contradiction = 0.0;       ///< share of what the map has along the way here that the scans see through
+  double contradiction_once = 0.0;  ///< the same of the scan that contradicts most
   double distance_m = 0.0;  ///< between the two sensor poses of the closure
 
   /// Share of what should be seen that is seen; 0 where nothing is expected.
@@ -48,7 +58,10 @@ void MeasureCoverage(const std::vector<Eigen::Vector3d>& centroids_local,
                      Evidence* evidence);
 
 /// Whether a recognition is accepted, or why not.
-enum class Verdict { kAccepted, kAmbiguous, kUncovered, kUncertain, kTooFar };
+enum class Verdict { kAccepted, kAmbiguous, kUncovered, kContradicted, kUncertain, kTooFar };
+
+/// Whether another set of correspondences is too large beside the inliers.
+bool HasRival(const Evidence& evidence, const AcceptanceParameters& parameters);
 
 /// Judges the evidence. O(1).
 Verdict Judge(const Evidence& evidence, const AcceptanceParameters& parameters);

@@ -2,7 +2,9 @@
 /// Map side: changed segments of any number of robots to recognitions; owns the target map (METHOD 4 and 5).
 #pragma once
 
+#include <deque>
 #include <functional>
+#include <limits>
 #include <map>
 #include <optional>
 #include <string>
@@ -11,6 +13,7 @@
 
 #include "incremental_segmatch/acceptance.hpp"
 #include "incremental_segmatch/point_refinement.hpp"
+#include "incremental_segmatch/range_image.hpp"
 #include "incremental_segmatch/recognizer.hpp"
 #include "incremental_segmatch/segment_delta.hpp"
 #include "incremental_segmatch/stage_times.hpp"
@@ -35,11 +38,19 @@ struct MatchingParameters {
   double requery_distance = 0.2;  ///< a segment is matched anew once its scaled descriptor moved so far
 };
 
-/// Which points of the matched segments refine a recognition: the nearer they are to the sensor, the less has odometry
-/// drifted between them and the closure's two poses.
-struct NearPointsParameters {
-  double radius_m = 35.0;         ///< points so near to the query's sensor are used, if they are enough
-  std::size_t min_points = 1500;  ///< if not, the radius is doubled until they are, or all are in
+/// Whose scans are kept along a trajectory, and how many of them make a recognition's counterpart.
+struct KeyframeParameters {
+  double spacing_m = 2.0;         ///< path between key frames; none where one was recognised to be this near
+  double submap_radius_m = 10.0;  ///< scans so near to a key frame's, along the trajectory, are joined to its own
+  double reach_m = 50.0;          ///< path between a closure's key frame and poses that matched segments were seen from
+};
+
+/// How much of the way that led to a place speaks for or against it: two places that look alike lie on different ways.
+struct HistoryParameters {
+  double length_m = 150.0;      ///< of path behind the robot
+  double spacing_m = 10.0;      ///< path between the scans that are kept
+  double max_distance_m = 8.0;  ///< from where a recognition puts such a scan to the key frame that it is held against
+  double drift = 0.01;          ///< metres of odometry's drift per metre of path that are allowed for
 };
 
 /// Of the map side.
@@ -47,8 +58,10 @@ struct BackEndParameters {
   Mode mode = Mode::kLoopClosure;    ///< loop closure or localization
   MatchingParameters matching;       ///< candidates of a local segment
   RecognizerParameters recognizer;   ///< candidates to a transform
-  NearPointsParameters near_points;  ///< which points refine
-  RefinementParameters refinement;   ///< the transform on the segments' points
+  KeyframeParameters keyframes;      ///< which scans are kept
+  HistoryParameters history;         ///< of the way here, as evidence
+  FreeSpaceParameters free_space;    ///< when a scan contradicts another
+  RefinementParameters refinement;   ///< of the transform, on scans
   AcceptanceParameters acceptance;   ///< evidence that a recognition must have
   TargetMapParameters target_map;    ///< what is kept
 };
@@ -93,6 +106,7 @@ enum class StepEnd {
   kTooYoung,
   kAmbiguous,
   kUncovered,
+  kContradicted,
   kUncertain,
   kTooFar
 };
@@ -162,13 +176,17 @@ class BackEnd {
     Descriptor descriptor;
     StampNs last_seen_ns = 0;
     double last_seen_path_m = 0.0;
-    std::shared_ptr<const Points> points_centroid;                 // of its newest view
-    Eigen::Vector3d points_origin_odom = Eigen::Vector3d::Zero();  // what those points are relative to
-    std::optional<SegmentKey> same_as;                             // target segment that it was recognised as
+    std::optional<SegmentKey> same_as;  // target segment that it was recognised as
     Descriptor queried;                                            // descriptor at the last query; empty: never
     std::uint64_t queried_generation = 0;
     std::uint64_t next_item = 0;              // of the index at the last look
     std::vector<TargetCandidate> candidates;  // nearest first
+  };
+  // A scan of the way that a robot has come.
+  struct PastScan {
+    Pose T_odom_sensor;
+    double path_m = 0.0;
+    RangeImage image;
   };
   struct Robot {
     std::string name;
@@ -177,15 +195,24 @@ class BackEnd {
     std::uint64_t sequence = 0;
     StampNs stamp_ns = 0;
     double path_m = 0.0;
-    std::vector<double> path_at_pose_m;  // in loop closure, by index of trajectory pose
+    double twin_path_m = -std::numeric_limits<double>::infinity();      // where a place last had a twin
+    double keyframe_path_m = -std::numeric_limits<double>::infinity();  // where the last key frame was kept
     Pose T_odom_sensor = Pose::Identity();      // odom without its jumps, here and in all else that is kept
     Pose T_odom_continuous = Pose::Identity();  // and the jumps
+    std::shared_ptr<const Points> scan_sensor;  // of the last delta
+    std::deque<PastScan> history;
     std::map<SegmentId, LocalSegment> local;
   };
   // A segment that is no longer tracked, and waits for the time window to pass.
   struct Waiting {
     SegmentKey segment;
     double last_seen_path_m = 0.0;
+  };
+
+  // A key frame of the map.
+  struct KeyframeName {
+    RobotIndex robot = 0;
+    std::size_t index = 0;
   };
 
   RobotIndex RobotByName(const std::string& name);
@@ -200,12 +227,20 @@ class BackEnd {
   bool NeedsQuery(RobotIndex robot, const LocalSegment& segment) const;
   std::map<RobotIndex, Correspondences> CollectCorrespondences(RobotIndex robot) const;
   RecognizerResult Recognize(RobotIndex robot, const std::map<RobotIndex, Correspondences>& by_frame);
-  const SegmentView& MatchedView(RobotIndex robot, const Correspondence& inlier) const;
   std::optional<Closure> Verify(RobotIndex robot, StampNs stamp_ns, const RecognizerResult& result,
                                 BackEndCounts* counts) const;
-  std::optional<RefinedTransform> Refine(RobotIndex robot, const Recognition& recognition) const;
+  const SegmentView& MatchedView(RobotIndex robot, const Correspondence& inlier) const;
+  const TrajectoryPose& PoseOf(const KeyframeName& keyframe) const;
+  std::optional<KeyframeName> NearestKeyframeAlong(const KeyframeName& around, double along_m, const Eigen::Vector3d& place) const;
+  void MeasureContradiction(RobotIndex robot, const KeyframeName& target, const Closure& closure, Evidence* evidence) const;
+  void KeepHistory(RobotIndex robot);
+  bool IsYoung(RobotIndex robot, StampNs now_ns, std::uint32_t pose) const;
+  std::optional<KeyframeName> NearestKeyframe(RobotIndex robot, StampNs stamp_ns, const Recognition& recognition) const;
+  std::optional<RefinedTransform> Refine(RobotIndex robot, const KeyframeName& target, const Pose& T_target_query) const;
+  std::vector<Eigen::Vector3d> Submap(const KeyframeName& center) const;
   void MeasureCoverage(RobotIndex robot, const Pose& T_map_odom, Evidence* evidence) const;
-  std::optional<Closure> MakeClosure(RobotIndex robot, StampNs stamp_ns, const Recognition& recognition) const;
+  Closure MakeClosure(RobotIndex robot, StampNs stamp_ns, const Recognition& recognition, const KeyframeName& keyframe) const;
+  void KeepKeyframe(RobotIndex robot, const std::optional<Closure>& closure);
   void AcceptClosure(RobotIndex robot, const Closure& closure);
   void JoinFrames(RobotIndex robot, RobotIndex target_robot, const Pose& T_map_odom);
 

@@ -12,6 +12,7 @@
 #include "incremental_segmatch/ground_filter.hpp"
 #include "incremental_segmatch/incremental_normals.hpp"
 #include "incremental_segmatch/incremental_segmenter.hpp"
+#include "incremental_segmatch/scan_thinning.hpp"
 #include "incremental_segmatch/segment_delta.hpp"
 #include "incremental_segmatch/stage_times.hpp"
 #include "incremental_segmatch/types.hpp"
@@ -35,6 +36,7 @@ struct FrontEndParameters {
   SmoothnessParameters smoothness;  ///< kSmoothness: which neighbours belong together
   DescriptorParameters descriptor;  ///< features of a segment
   ViewParameters view;              ///< when a view is kept
+  ScanThinningParameters thinning;  ///< of the scan that goes along, for refinement
 };
 
 /// The robot side's part of the funnel.

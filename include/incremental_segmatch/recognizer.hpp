@@ -20,6 +20,7 @@ struct RecognizerParameters {
   double min_spread_m = 1.0;          ///< second largest standard deviation of the inlier centroids; refuses lines; > 0
   double min_sigma_m = 0.05;          ///< floor of a centroid's standard deviation per axis in the covariance, > 0
   bool find_runner_up = true;         ///< also look for the best clique beside the winner: evidence against ambiguity
+  double same_place_m = 2.0;          ///< correspondences that fit the winner's transform so well are no rivals of it
   std::chrono::microseconds runner_up_deadline{20000};  ///< of that search, > 0
 };
 
@@ -37,8 +38,8 @@ struct Recognition {
   double tilt_rad = 0.0;                ///< angle between the z axes of the two maps
   bool proven_maximum = true;           ///< false if the deadline ended the search for a larger clique
   std::size_t max_inliers = 0;          ///< no clique is larger than this; inliers.size() if proven
-  /// Size of the largest clique that shares no correspondence with the inliers: near inliers.size() means that the
-  /// place is ambiguous. 0 if it is smaller than 3 or than half of the inliers, or not looked for. A lower bound if
+  /// Size of the largest clique that shares no correspondence with the inliers, nor has any that fits their transform:
+  /// near inliers.size() means that another place is as likely. 0 if it is smaller than 3 or than half of the inliers, or not looked for. A lower bound if
   /// runner_up_deadline ended the search.
   std::size_t runner_up_size = 0;
 };

@@ -33,6 +33,7 @@ struct SegmentDelta {
   /// All jumps of odom so far: the pose of the frame that odom would be without them. The identity where it never
   /// jumps. A sum and not the last one, so that none is lost with a delta.
   Pose T_odom_continuous = Pose::Identity();
+  std::shared_ptr<const Points> scan_sensor;  ///< the scan, thinned (see ThinScan), sensor frame; may be null
   bool full_state = false;                ///< `changed` holds every tracked segment, and replaces all said before
   std::vector<SegmentState> changed;      ///< ascending IDs
   std::vector<RenamedSegment> renamed;    ///< merged segments

@@ -20,7 +20,13 @@ struct TrajectoryPose {
   StampNs stamp_ns = 0;                   ///< of the scan
   Pose T_odom_sensor = Pose::Identity();  ///< as odometry had it
   Pose T_map_sensor = Pose::Identity();   ///< as corrected
+  double path_m = 0.0;                    ///< gone since the trajectory began, by odometry
 };
+
+/// Path at the pose that follows another one.
+inline double PathAfter(const TrajectoryPose& before, const Pose& T_odom_sensor) {
+  return before.path_m + (T_odom_sensor.translation() - before.T_odom_sensor.translation()).norm();
+}
 
 /// One look at a segment.
 struct SegmentView {
@@ -37,6 +43,12 @@ struct TargetSegment {
   std::vector<SegmentView> views;  ///< oldest first; never empty
   StampNs last_seen_ns = 0;        ///< stamp of the last scan that changed it
   bool tracked = false;            ///< by its robot's local map, now
+};
+
+/// A pose of a trajectory whose scan is kept: what recognitions are refined on and closures refer to.
+struct Keyframe {
+  std::uint32_t pose = 0;                     ///< index of its trajectory pose
+  std::shared_ptr<const Points> scan_sensor;  ///< thinned, in that pose's sensor frame; may be null
 };
 
 /// What is kept.
@@ -71,6 +83,12 @@ class TargetMap {
   /// is ignored. T_map_odom is then that of the newest corrected pose. Throws std::invalid_argument if a pose is not
   /// finite: nothing has changed then. O((trajectory + corrections) log).
   void CorrectTrajectory(RobotIndex robot, const std::vector<StampedPose>& T_map_sensor);
+
+  /// Keeps the scan of a robot's newest pose. Throws std::invalid_argument if the robot has no pose that is newer than
+  /// its last key frame's.
+  void AddKeyframe(RobotIndex robot, std::shared_ptr<const Points> scan_sensor);
+  /// Key frames of a robot, in order of its trajectory.
+  const std::vector<Keyframe>& Keyframes(RobotIndex robot) const { return robots_.at(robot).keyframes; }
 
   /// Sets the newest state of a segment, which is tracked from now on: `view` replaces the last view of its robot
   /// unless `keep_last`. Throws std::invalid_argument if the view's pose does not exist.
@@ -111,6 +129,7 @@ class TargetMap {
     std::string name;
     std::vector<TrajectoryPose> trajectory;
     Pose T_map_odom = Pose::Identity();
+    std::vector<Keyframe> keyframes;
   };
   /// Orders views by their pose's stamp and keeps max_views of them.
   void TidyViews(std::vector<SegmentView>* views) const;

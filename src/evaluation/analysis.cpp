@@ -184,6 +184,8 @@ std::vector<EvidenceColumn> EvidenceColumns() {
   return {{"runner_up", [](const Evidence& e) { return e.runner_up; }},
           {"expected", [](const Evidence& e) { return e.expected; }},
           {"supported", [](const Evidence& e) { return e.supported; }},
+          {"contradiction", [](const Evidence& e) { return e.contradiction; }},
+          {"contradiction_once", [](const Evidence& e) { return e.contradiction_once; }},
           {"overlap", [](const Evidence& e) { return e.overlap; }},
           {"sigma_m", [](const Evidence& e) { return e.sigma_m; }},
           {"sigma_rad", [](const Evidence& e) { return e.sigma_rad; }}};

@@ -315,6 +315,20 @@ TEST(Recognizer, ReportsTheRunnerUp) {
   ASSERT_TRUE(result.recognition.has_value());
   EXPECT_EQ(result.recognition->inliers.size(), 10u);
   EXPECT_EQ(result.recognition->runner_up_size, 9u);
+
+  // Further sightings of the winner's own objects, as another visit left them, are no rivals.
+  Correspondences seen_twice;
+  for (const Correspondence& c : correspondences) {
+    if (c.target.id > 100) continue;
+    seen_twice.push_back(c);
+    seen_twice.push_back(Make(c.local.id, 200 + c.target.id, c.centroid_local, c.centroid_target + random.Noise(0.05)));
+  }
+  const RecognizerResult alone = Recognizer(parameters).Recognize(seen_twice);
+  ASSERT_TRUE(alone.recognition.has_value());
+  EXPECT_EQ(alone.recognition->runner_up_size, 0u);
+  parameters.same_place_m = 0.0;
+  EXPECT_GE(Recognizer(parameters).Recognize(seen_twice).recognition->runner_up_size, 8u);
+
   parameters.find_runner_up = false;
   EXPECT_EQ(Recognizer(parameters).Recognize(correspondences).recognition->runner_up_size, 0u);
 }

@@ -26,7 +26,17 @@ TEST(Pipeline, FindsTheSecondLapAndNothingFalse) {
   EXPECT_EQ(score.trivial_closures, 0u);
   EXPECT_EQ(score.unmatched_closures, 0u);
   EXPECT_GE(score.recall, 0.7);
-  EXPECT_LE(score.translation_error_median_m, 0.3);
+  EXPECT_LE(score.translation_error_median_m, 0.05);
+  EXPECT_LE(score.rotation_error_95_deg, 0.5);
+}
+
+TEST(Pipeline, RefinementOnScansImprovesThePose) {
+  BackEndParameters parameters;
+  parameters.refinement.enabled = false;
+  BackEnd back_end(parameters);
+  const Score unrefined = ScoreRun(TwoLaps(), Process(TwoLaps(), &back_end)), refined = ScoreRun(TwoLaps(), Undisturbed());
+  EXPECT_LT(refined.translation_error_median_m, 0.5 * unrefined.translation_error_median_m);
+  EXPECT_LT(refined.rotation_error_median_deg, 0.5 * unrefined.rotation_error_median_deg);
 }
 
 TEST(Pipeline, RecognitionsHaveNoPriorOnThePose) {
@@ -82,7 +92,10 @@ TEST(Pipeline, LocalizesInYesterdaysMap) {
     };
     const Pose truth = today.T_world_sensor[index(closure.stamp_target_ns)].inverse() *
                        today.T_world_sensor[index(closure.stamp_query_ns)];
-    right += (closure.T_target_query.translation() - truth.translation()).norm() < 1.0;
+    const double error_m = (closure.T_target_query.translation() - truth.translation()).norm();
+    right += error_m < 1.0;
+    EXPECT_LT(error_m, 1.0) << "query at " << closure.stamp_query_ns << " ns, target at " << closure.stamp_target_ns << " ns, "
+                            << closure.inliers << " inliers";
   }
   EXPECT_EQ(right, run.closures.size());
   EXPECT_GE(right, today.scans.size() / 2);

@@ -51,6 +51,10 @@ SegmentDelta RandomDelta(std::mt19937& random) {
     }
     delta.changed.push_back(state);
   }
+  auto scan = std::make_shared<Points>(1 + random() % 50);
+  for (Eigen::Vector3f& p : *scan)
+    p = (40.0 * Eigen::Vector3d(unit(random), unit(random), unit(random))).cast<float>();
+  delta.scan_sensor = scan;
   delta.renamed = {{12, 5}, {30, 2}};
   delta.retired = {{40, RetirementCause::kTooLarge}, {41, RetirementCause::kCut}, {42, RetirementCause::kLeft}};
   return delta;
@@ -75,6 +79,10 @@ TEST(Conversions, DeltaComesBackFromItsMessage) {
     EXPECT_EQ(back.stamp_ns, delta.stamp_ns);
     EXPECT_EQ(back.full_state, delta.full_state);
     ExpectSamePoses(back.T_odom_sensor, delta.T_odom_sensor);
+    ASSERT_NE(back.scan_sensor, nullptr);
+    ASSERT_EQ(back.scan_sensor->size(), delta.scan_sensor->size());
+    for (std::size_t k = 0; k < delta.scan_sensor->size(); ++k)
+      EXPECT_LT(((*back.scan_sensor)[k] - (*delta.scan_sensor)[k]).cwiseAbs().maxCoeff(), 0.00101f);
     ASSERT_EQ(back.changed.size(), delta.changed.size());
     for (std::size_t i = 0; i < delta.changed.size(); ++i) {
       const SegmentState& a = delta.changed[i];

@@ -290,7 +290,10 @@ TEST(Parameters, EveryMemberOfEveryStructIsInTheTable) {
   EXPECT_EQ(entries("back_end.recognizer"), CountMembers<RecognizerParameters>());
   EXPECT_EQ(entries("back_end.recognizer.consistency"), CountMembers<ConsistencyParameters>());
   EXPECT_EQ(entries("back_end.recognizer.clique"), CountMembers<MaxCliqueParameters>());
-  EXPECT_EQ(entries("back_end.near_points"), CountMembers<NearPointsParameters>());
+  EXPECT_EQ(entries("back_end.history"), CountMembers<HistoryParameters>());
+  EXPECT_EQ(entries("back_end.free_space"), CountMembers<FreeSpaceParameters>());
+  EXPECT_EQ(entries("back_end.keyframes"), CountMembers<KeyframeParameters>());
+  EXPECT_EQ(entries("front_end.thinning"), CountMembers<ScanThinningParameters>());
   EXPECT_EQ(entries("back_end.refinement"), CountMembers<RefinementParameters>());
   EXPECT_EQ(entries("back_end.acceptance"), CountMembers<AcceptanceParameters>());
   EXPECT_EQ(entries("back_end.target_map"), CountMembers<TargetMapParameters>());

@@ -46,6 +46,11 @@ TargetMap RandomMap(unsigned seed, int robots, int poses, int segments) {
     StampNs stamp_ns = r == 0 ? std::numeric_limits<StampNs>::min() : static_cast<StampNs>(random()) * 1000000000;
     for (int i = 0; i < poses; ++i) {
       map.AddPose(robot, stamp_ns, RandomPose(random));
+      if (i % 3 == 1) {
+        auto scan = std::make_shared<Points>(random() % 50);
+        for (Eigen::Vector3f& p : *scan) p << normal(random), normal(random), normal(random);
+        map.AddKeyframe(robot, i % 2 == 0 ? nullptr : scan);
+      }
       if (i % 7 == 3) corrected.push_back({stamp_ns, RandomPose(random)});
       stamp_ns += 1 + static_cast<StampNs>(random() % 1000000);
     }
@@ -83,6 +88,18 @@ void ExpectSameTrajectory(const TargetMap& a, const TargetMap& b, RobotIndex rob
   }
 }
 
+void ExpectSameKeyframes(const TargetMap& a, const TargetMap& b, RobotIndex robot) {
+  ASSERT_EQ(a.Keyframes(robot).size(), b.Keyframes(robot).size());
+  for (std::size_t i = 0; i < a.Keyframes(robot).size(); ++i) {
+    const Keyframe &was = a.Keyframes(robot)[i], &is = b.Keyframes(robot)[i];
+    EXPECT_EQ(was.pose, is.pose);
+    ASSERT_EQ(was.scan_sensor == nullptr, is.scan_sensor == nullptr);
+    if (was.scan_sensor) {
+      EXPECT_EQ(*was.scan_sensor, *is.scan_sensor);
+    }
+  }
+}
+
 void ExpectSameView(const SegmentView& a, const SegmentView& b) {
   EXPECT_EQ(a.robot, b.robot);
   EXPECT_EQ(a.pose, b.pose);
@@ -99,7 +116,10 @@ void ExpectSameView(const SegmentView& a, const SegmentView& b) {
 // Equal but for `tracked`, which a file does not hold.
 void ExpectSame(const TargetMap& a, const TargetMap& b) {
   ASSERT_EQ(a.robots(), b.robots());
-  for (RobotIndex robot = 0; robot < a.robots(); ++robot) ExpectSameTrajectory(a, b, robot);
+  for (RobotIndex robot = 0; robot < a.robots(); ++robot) {
+    ExpectSameTrajectory(a, b, robot);
+    ExpectSameKeyframes(a, b, robot);
+  }
   ASSERT_EQ(a.segments().size(), b.segments().size());
   for (auto at = a.segments().begin(), bt = b.segments().begin(); at != a.segments().end(); ++at, ++bt) {
     EXPECT_EQ(at->first, bt->first);
@@ -232,8 +252,11 @@ TEST_F(TargetMapFile, WhatIsNoWholeMapOfThisVersionIsRefused) {
   ExpectRefused(whole + "x", "is damaged");
   ExpectRefused(std::string(100, 'x'), "is not a segment map");
   Bytes newer = whole;
-  newer[8] = 2;
-  ExpectRefused(newer, "is of version 2");
+  newer[8] = 3;
+  ExpectRefused(newer, "is of version 3");
+  Bytes older = whole;
+  older[8] = 1;
+  ExpectRefused(older, "is of version 1");
 }
 
 TEST_F(TargetMapFile, WhatIsNotThereOrNoFileIsRefused) {

@@ -54,6 +54,23 @@ TEST(TargetMap, NamesRobotsInTheOrderInWhichTheyCome) {
   EXPECT_THROW(map.RobotName(2), std::out_of_range);
 }
 
+TEST(TargetMap, KeepsAtMostOneKeyframeAPose) {
+  TargetMap map({});
+  const RobotIndex robot = map.RobotByName("a");
+  const auto scan = std::make_shared<const Points>(Points{{1.f, 2.f, 3.f}});
+  EXPECT_THROW(map.AddKeyframe(robot, scan), std::invalid_argument);  // there is no pose yet
+  map.AddPose(robot, 0, Pose::Identity());
+  map.AddPose(robot, 1, Pose::Identity());
+  map.AddKeyframe(robot, scan);
+  EXPECT_THROW(map.AddKeyframe(robot, scan), std::invalid_argument);  // the newest pose has one
+  map.AddPose(robot, 2, Pose::Identity());
+  map.AddKeyframe(robot, nullptr);
+  ASSERT_EQ(map.Keyframes(robot).size(), 2u);
+  EXPECT_EQ(map.Keyframes(robot)[0].pose, 1u);
+  EXPECT_EQ(map.Keyframes(robot)[0].scan_sensor, scan);
+  EXPECT_EQ(map.Keyframes(robot)[1].pose, 2u);
+}
+
 TEST(TargetMap, RefusesStampsThatDoNotIncreaseAndPosesThatAreNotFinite) {
   TargetMap map({});
   const RobotIndex robot = map.RobotByName("a");
