@@ -39,12 +39,15 @@ void Pair(BackEndConfig& config, BackEndNodelets& parameters, const Visit& visit
   visit(config.max_rms_m, core.recognizer.max_rms_m);
   visit(config.min_spread_m, core.recognizer.min_spread_m);
   visit(config.refine, core.refinement.enabled);
-  visit(config.near_points_m, core.near_points.radius_m);
+  visit(config.submap_radius_m, core.keyframes.submap_radius_m);
   visit(config.min_overlap, core.refinement.min_overlap);
   visit(config.support_distance_m, core.acceptance.support_distance_m);
   visit(config.neighbourhood_m, core.acceptance.neighbourhood_m);
   visit(config.min_coverage, core.acceptance.min_coverage);
-  visit(config.min_margin, core.acceptance.min_margin);
+  visit(config.min_ratio, core.acceptance.min_ratio);
+  visit(config.twin_memory_m, core.acceptance.twin_memory_m);
+  visit(config.max_contradiction, core.acceptance.max_contradiction);
+  visit(config.max_contradiction_once, core.acceptance.max_contradiction_once);
   visit(config.max_distance_m, core.acceptance.max_distance_m);
   visit(config.max_sigma_m, core.acceptance.max_sigma_m);
   visit(config.max_sigma_rad, core.acceptance.max_sigma_rad);
