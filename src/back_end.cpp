@@ -570,6 +570,8 @@ void BackEnd::MeasureContradiction(RobotIndex index, const KeyframeName& target,
     const std::optional<KeyframeName> there =
         NearestKeyframeAlong(target, back_m + parameters_.keyframes.reach_m, T_map_past.translation());
     if (!there) continue;
+    // The same pass again would only tell its own drift.
+    if (there->robot == index && past.path_m - PoseOf(*there).path_m <= parameters_.matching.min_path_m) continue;
     const Points* scan_there = map_.Keyframes(there->robot)[there->index].scan_sensor.get();
     if (scan_there == nullptr) continue;
     // Both visits have drifted on the way between there and here.

@@ -19,6 +19,7 @@ struct FreeSpaceCounts {
     const std::size_t judged = confirmed + seen_through;
     return judged == 0 ? 0.0 : static_cast<double>(seen_through) / static_cast<double>(judged);
   }
+  /// Adds the counts of another comparison.
   FreeSpaceCounts& operator+=(const FreeSpaceCounts& other) {
     confirmed += other.confirmed;
     seen_through += other.seen_through;

@@ -67,7 +67,7 @@ TEST(RangeImage, LeavesOutWhatIsLowFarOrWithinTheSlack) {
     return counts.confirmed + counts.seen_through;
   };
   EXPECT_GT(judged(10.0, 0.0), 1000u);
-  EXPECT_EQ(judged(10.0, 5.5), 0u);  // neither within 6 m nor farther by 12 m
+  EXPECT_EQ(judged(10.0, 8.5), 0u);  // neither within 9 m nor farther by 18 m
   parameters.max_range_m = 9.0;
   EXPECT_EQ(judged(10.0, 0.0), 0u);
   parameters = AllHeights();
