@@ -26,8 +26,8 @@ struct AcceptanceParameters {
   double max_distance_m = 20.0;  ///< of the query from the pose its target was seen from: odometry drifts in between
   double max_sigma_m = 0.5;      ///< largest standard deviation of the query's position, along its worst axis
   double max_sigma_rad = 0.02;   ///< the same of its orientation
-  double max_contradiction = 0.03;        ///< share of what the map has there that the scans see through, over all
-  double max_contradiction_once = 0.1;    ///< and in any one of the scans
+  double max_contradiction = 0.06;        ///< share of what the map has there that the scans see through, over all
+  double max_contradiction_once = 0.2;    ///< and in any one of the scans
 };
 
 /// What speaks for and against a recognition.

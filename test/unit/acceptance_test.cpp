@@ -34,8 +34,8 @@ TEST(Acceptance, EachPartOfTheEvidenceCanRefuse) {
   EXPECT_EQ(judge([](Evidence& e) { e.since_twin_m = 101.0; }), Verdict::kAccepted);
   EXPECT_EQ(judge([](Evidence& e) { e.supported = 14; }), Verdict::kUncovered);
   EXPECT_EQ(judge([](Evidence& e) { e.expected = e.supported = 0; }), Verdict::kUncovered);
-  EXPECT_EQ(judge([](Evidence& e) { e.contradiction = 0.04; }), Verdict::kContradicted);
-  EXPECT_EQ(judge([](Evidence& e) { e.contradiction_once = 0.11; }), Verdict::kContradicted);
+  EXPECT_EQ(judge([](Evidence& e) { e.contradiction = 0.07; }), Verdict::kContradicted);
+  EXPECT_EQ(judge([](Evidence& e) { e.contradiction_once = 0.21; }), Verdict::kContradicted);
   EXPECT_EQ(judge([](Evidence& e) { e.sigma_m = 0.6; }), Verdict::kUncertain);
   EXPECT_EQ(judge([](Evidence& e) { e.sigma_rad = 0.03; }), Verdict::kUncertain);
   EXPECT_EQ(judge([](Evidence& e) { e.distance_m = 21.0; }), Verdict::kTooFar);
