@@ -10,6 +10,7 @@
 #include <set>
 #include <utility>
 
+#include "incremental_segmatch/twist.hpp"
 #include "markers.hpp"
 
 namespace incremental_segmatch {
@@ -408,7 +409,7 @@ void BackEndNodelet::PublishClosure(const Closure& closure, Robot& robot) {
 void BackEndNodelet::PublishLocalization(const Closure& closure, const Robot& robot) {
   const Pose T_sensor_base = robot.frames.T_base_sensor.inverse();
   const Pose T_map_base = closure.T_map_odom * robot.T_odom_sensor * T_sensor_base;
-  const Covariance6 covariance = MoveRightPerturbation(closure.covariance, T_sensor_base);
+  const Covariance6 covariance = MoveToTheRight(closure.covariance, T_sensor_base);
   geometry_msgs::PoseWithCovarianceStamped message;
   message.header = MapHeader(robot.stamp_ns);
   message.pose = ToPoseWithCovariance(T_map_base, RightPerturbationToParentAxes(covariance, T_map_base));

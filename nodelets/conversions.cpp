@@ -5,6 +5,8 @@
 #include <limits>
 #include <stdexcept>
 
+#include "incremental_segmatch/twist.hpp"
+
 namespace incremental_segmatch {
 namespace {
 
@@ -42,21 +44,6 @@ geometry_msgs::Quaternion ToQuaternion(const Eigen::Matrix3d& R) {
   message.z = q.z();
   message.w = q.w();
   return message;
-}
-
-Eigen::Matrix3d Skew(const Eigen::Vector3d& v) {
-  Eigen::Matrix3d S;
-  S << 0.0, -v.z(), v.y(), v.z(), 0.0, -v.x(), -v.y(), v.x(), 0.0;
-  return S;
-}
-
-/// Ad(T) for twists in the order translation, rotation.
-Covariance6 Adjoint(const Pose& T) {
-  Covariance6 adjoint = Covariance6::Zero();
-  adjoint.topLeftCorner<3, 3>() = T.linear();
-  adjoint.bottomRightCorner<3, 3>() = T.linear();
-  adjoint.topRightCorner<3, 3>() = Skew(T.translation()) * T.linear();
-  return adjoint;
 }
 
 /// To the nearest; in range, and inline, which std::lround is not.
@@ -202,11 +189,6 @@ Covariance6 ToCovariance(const geometry_msgs::PoseWithCovariance& pose) {
   return Eigen::Map<const Eigen::Matrix<double, 6, 6, Eigen::RowMajor>>(pose.covariance.data());
 }
 
-Covariance6 MoveRightPerturbation(const Covariance6& covariance, const Pose& B) {
-  const Covariance6 adjoint = Adjoint(B.inverse());
-  return adjoint * covariance * adjoint.transpose();
-}
-
 Covariance6 RightPerturbationToParentAxes(const Covariance6& covariance, const Pose& T_parent_child) {
   Covariance6 rotation = Covariance6::Zero();
   rotation.topLeftCorner<3, 3>() = T_parent_child.linear();
@@ -290,7 +272,7 @@ LoopClosure ToLoopClosure(const Closure& closure, FrameKind frame_kind, const Ro
     message.frame_query = query.base_frame;
     message.frame_target = target.base_frame;
     message.relative_pose = ToPoseWithCovariance(target.T_base_sensor * closure.T_target_query * T_sensor_base,
-                                                 MoveRightPerturbation(closure.covariance, T_sensor_base));
+                                                 MoveToTheRight(closure.covariance, T_sensor_base));
   } else {
     message.frame_kind = LoopClosure::FRAME_SENSOR;
     message.frame_query = query.sensor_frame;
@@ -319,7 +301,7 @@ SensorClosure ToSensorClosure(const LoopClosure& message, const RobotFrames& que
   if (message.frame_kind != LoopClosure::FRAME_BASE)
     throw std::invalid_argument("loop closure with the unknown frame_kind " + std::to_string(message.frame_kind));
   return {target.T_base_sensor.inverse() * T * query.T_base_sensor,
-          MoveRightPerturbation(covariance, query.T_base_sensor)};
+          MoveToTheRight(covariance, query.T_base_sensor)};
 }
 
 nav_msgs::Path ToPath(const std::vector<StampedPose>& trajectory, FrameKind frame_kind, const RobotFrames& robot,

@@ -54,9 +54,6 @@ Pose ToPose(const geometry_msgs::Transform& transform, const std::string& what);
 geometry_msgs::PoseWithCovariance ToPoseWithCovariance(const Pose& T, const Covariance6& covariance);
 Covariance6 ToCovariance(const geometry_msgs::PoseWithCovariance& pose);
 
-/// Covariance of A T B, perturbed on the right, from that of T: T exp(xi) B = T B exp(Ad(B^-1) xi).
-Covariance6 MoveRightPerturbation(const Covariance6& covariance, const Pose& B);
-
 /// Covariance of a pose's position and orientation about the parent's axes, as geometry_msgs has it for a pose in a
 /// map, from that of a perturbation on the right, T_parent_child exp(xi).
 Covariance6 RightPerturbationToParentAxes(const Covariance6& covariance, const Pose& T_parent_child);

@@ -7,6 +7,8 @@
 #include <stdexcept>
 #include <utility>
 
+#include "incremental_segmatch/twist.hpp"
+
 namespace incremental_segmatch {
 namespace {
 
@@ -32,22 +34,6 @@ StepEnd ToStepEnd(Verdict verdict) {
     case Verdict::kTooFar: return StepEnd::kTooFar;
   }
   return StepEnd::kUncertain;
-}
-
-/// A covariance of T_a_b perturbed on the left, exp(xi) T_a_b, as that of the perturbation on the right,
-/// T_a_b exp(Ad(T_a_b^-1) xi).
-Covariance6 PerturbedOnTheRight(const Covariance6& covariance_left, const Pose& T_a_b) {
-  const Pose inverse = T_a_b.inverse();
-  const Eigen::Matrix3d R = inverse.linear();
-  const Eigen::Vector3d t = inverse.translation();
-  Eigen::Matrix3d t_cross;
-  t_cross << 0, -t.z(), t.y(), t.z(), 0, -t.x(), -t.y(), t.x(), 0;
-  Covariance6 adjoint = Covariance6::Zero();
-  adjoint.topLeftCorner<3, 3>() = R;
-  adjoint.topRightCorner<3, 3>() = t_cross * R;
-  adjoint.bottomRightCorner<3, 3>() = R;
-  const Covariance6 covariance = adjoint * covariance_left * adjoint.transpose();
-  return 0.5 * (covariance + covariance.transpose());
 }
 
 /// A delta in the frame that odom would be without its jumps.
@@ -461,7 +447,7 @@ std::optional<Closure> BackEnd::Verify(RobotIndex robot, StampNs stamp_ns, const
     closure.T_map_odom = closure.T_map_odom * robots_[robot].T_odom_sensor * closure.T_target_query.inverse() *
                          refined->T_target_local * robots_[robot].T_odom_sensor.inverse();
     closure.T_target_query = refined->T_target_local;
-    closure.covariance = PerturbedOnTheRight(refined->covariance, closure.T_target_query);
+    closure.covariance = MoveToTheRight(refined->covariance, closure.T_target_query);
     evidence.overlap = refined->overlap;
   }
   MeasureCoverage(robot, closure.T_map_odom, &evidence);
@@ -639,7 +625,7 @@ Closure BackEnd::MakeClosure(RobotIndex robot, StampNs stamp_ns, const Recogniti
   closure.robot_query = robots_[robot].name;
   closure.robot_target = map_.RobotName(keyframe.robot);
   closure.T_target_query = target.T_map_sensor.inverse() * T_map_query;
-  closure.covariance = PerturbedOnTheRight(recognition.covariance, T_map_query);
+  closure.covariance = MoveToTheRight(recognition.covariance, T_map_query);
   closure.inliers = recognition.inliers.size();
   closure.rms_m = recognition.rms_m;
   closure.T_map_odom = recognition.T_target_local;

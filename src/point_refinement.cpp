@@ -10,6 +10,8 @@
 #include <stdexcept>
 #include <string>
 
+#include "incremental_segmatch/twist.hpp"
+
 namespace incremental_segmatch {
 namespace {
 
@@ -27,17 +29,9 @@ constexpr double kConvergedM = 5e-4;      // motion of the points in the last it
 constexpr double kMaxExtentM = 1e5;       // floats are exact enough to a centimetre up to here
 constexpr std::uint32_t kNone = 0xffffffffu;
 
-Eigen::Matrix3d Cross(const Eigen::Vector3d& v) {
-  Eigen::Matrix3d m;
-  m << 0, -v.z(), v.y(), v.z(), 0, -v.x(), -v.y(), v.x(), 0;
-  return m;
-}
-
 /// d(xi at origin) / d(xi at center): what a perturbation about a center is about the origin.
 Matrix6 Shift(const Eigen::Vector3d& center) {
-  Matrix6 adjoint = Matrix6::Identity();
-  adjoint.topRightCorner<3, 3>() = Cross(center);
-  return adjoint;
+  return Adjoint(Pose(Eigen::Translation3d(center)));
 }
 
 /// Points by cubic cells: contiguous per cell, the cells in an open hash table. Finds what is within a cell's side.
@@ -269,7 +263,7 @@ System BuildSystem(const std::vector<Eigen::Vector3f>& local, const Pose& T_targ
     const double square = difference.dot(force);
     const double weight = std::pow(width2 / (width2 + square), 2);  // Geman and McClure
     const Eigen::Vector3d at = p.cast<double>();
-    const Eigen::Matrix3d cross = Cross(at);
+    const Eigen::Matrix3d cross = CrossMatrix(at);
     const Eigen::Matrix3d metric_cross = metric * cross;
     system.information.topLeftCorner<3, 3>() += weight * metric;
     system.information.topRightCorner<3, 3>() -= weight * metric_cross;

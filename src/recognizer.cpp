@@ -10,6 +10,7 @@
 #include <tuple>
 #include <utility>
 
+#include "incremental_segmatch/twist.hpp"
 #include "radix_sort.hpp"
 
 namespace incremental_segmatch {
@@ -97,12 +98,6 @@ double SecondSpread(const Eigen::Matrix3Xd& points) {
 double TiltOf(const Pose& T) {
   const Eigen::Vector3d up = T.linear().col(2);
   return std::atan2(up.head<2>().norm(), up.z());
-}
-
-Eigen::Matrix3d CrossMatrix(const Eigen::Vector3d& v) {
-  Eigen::Matrix3d m;
-  m << 0.0, -v.z(), v.y(), v.z(), 0.0, -v.x(), -v.y(), v.x(), 0.0;
-  return m;
 }
 
 /// Prefers the clique with the smaller residual, then the smaller list of vertices, which are sorted by key. Residuals
@@ -206,8 +201,7 @@ Covariance6 TransformCovariance(const std::vector<Eigen::Vector3d>& points_targe
   about_centroid.topLeftCorner<3, 3>() = Eigen::Matrix3d::Identity() / static_cast<double>(points_target.size());
   about_centroid.bottomRightCorner<3, 3>() = rotation_information.inverse();
   // The translation of the origin: rho = tau - omega x c = tau + [c]x omega.
-  Covariance6 to_origin = Covariance6::Identity();
-  to_origin.topRightCorner<3, 3>() = CrossMatrix(centroid);
+  const Covariance6 to_origin = Adjoint(Pose(Eigen::Translation3d(centroid)));
   const Covariance6 covariance = sigma_m * sigma_m * to_origin * about_centroid * to_origin.transpose();
   return 0.5 * (covariance + covariance.transpose());
 }
