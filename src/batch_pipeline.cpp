@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <memory>
+#include <stdexcept>
 #include <utility>
 
 namespace incremental_segmatch {
@@ -23,6 +24,8 @@ std::shared_ptr<const Points> PointsOf(const std::vector<std::int32_t>& cluster,
 }  // namespace
 
 BatchBaselineParameters BatchParametersOf(const FrontEndParameters& front_end, const RecognizerParameters& recognizer) {
+  if (std::isfinite(front_end.local_path_m))
+    throw std::invalid_argument("front_end.local_path_m: the batch pipeline knows no such limit; set it to .inf");
   BatchBaselineParameters batch;
   batch.segmentation = front_end.segmentation;
   batch.local_radius_m = front_end.local_radius_m;

@@ -207,6 +207,7 @@ VoxelUpdate DynamicVoxelGrid::Insert(const Points& points_sensor, const Pose& T_
   // Blocks lie anywhere in memory. A chunk of points at a time, everything that a pass over the chunk needs was asked for by the
   // pass before it, so that the fetches overlap instead of following each other.
   VoxelUpdate update;
+  ++insertions_;
   Chunk chunk;
   std::array<Run, Chunk::kSize> runs;
   const CellTransform transform = CellTransformOf(T_odom_sensor);
@@ -336,6 +337,7 @@ void DynamicVoxelGrid::SettleTouched(VoxelUpdate* update) {
     Block& home = block(handle / kCellsPerBlock);
     Voxel& voxel = home.voxels[handle % kCellsPerBlock];
     home.touched &= ~(std::uint64_t{1} << (handle % kCellsPerBlock));
+    home.last_insertion = insertions_;
     voxel.centroid_block *= 1.f / static_cast<float>(voxel.count);
     return voxel;
   };
@@ -356,7 +358,8 @@ void DynamicVoxelGrid::SettleTouched(VoxelUpdate* update) {
   active_voxels_ += update->activated.size();
 }
 
-VoxelUpdate DynamicVoxelGrid::RemoveOutside(const Eigen::Vector3d& center_odom, double radius_m) {
+VoxelUpdate DynamicVoxelGrid::RemoveOutside(const Eigen::Vector3d& center_odom, double radius_m,
+                                            std::uint32_t oldest_insertion) {
   VoxelUpdate update;
   const Eigen::Vector3d center = T_odom_grid_.inverse() * center_odom;
   const double radius2 = radius_m * radius_m;
@@ -372,17 +375,19 @@ VoxelUpdate DynamicVoxelGrid::RemoveOutside(const Eigen::Vector3d& center_odom, 
   for (std::uint32_t t = 0; t < tiles_->tiles().size(); ++t) {
     const TileMap::Tile& tile = tiles_->tile(t);
     if (tile.blocks.empty()) continue;
-    if (distances2(tile.x * tile_m + parameters_.center_m[0], tile.y * tile_m + parameters_.center_m[1], tile_m).second <=
-        radius2)
+    if (oldest_insertion == 0 &&
+        distances2(tile.x * tile_m + parameters_.center_m[0], tile.y * tile_m + parameters_.center_m[1], tile_m).second <=
+            radius2)
       continue;
     for (std::size_t i = tile.blocks.size(); i-- > 0;) {  // backwards: removal swaps the last one in
       const std::uint32_t slot = tile.blocks[i];
       const Block& candidate = block(slot);
       const Eigen::Vector3d corner = BlockCorner(slot * kCellsPerBlock);
       const auto [nearest2, farthest2] = distances2(corner.x(), corner.y(), block_m);
-      if (farthest2 <= radius2) continue;
-      std::uint64_t leaving = 0;
-      for (std::uint64_t cells = candidate.occupied; cells != 0; cells &= cells - 1) {
+      const bool is_old = candidate.last_insertion < oldest_insertion;
+      if (farthest2 <= radius2 && !is_old) continue;
+      std::uint64_t leaving = is_old ? candidate.occupied : 0;
+      for (std::uint64_t cells = candidate.occupied & ~leaving; cells != 0; cells &= cells - 1) {
         const int cell = __builtin_ctzll(cells);
         const Eigen::Vector3f& c = candidate.voxels[cell].centroid_block;
         const double dx = corner.x() + c.x() - center.x(), dy = corner.y() + c.y() - center.y();

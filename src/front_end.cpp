@@ -1,6 +1,7 @@
 #include "incremental_segmatch/front_end.hpp"
 
 #include <algorithm>
+#include <cmath>
 #include <stdexcept>
 #include <utility>
 
@@ -37,6 +38,7 @@ FrontEnd::FrontEnd(const FrontEndParameters& parameters, std::string robot)
       segmenter_(MakeSegmenter(parameters, grid_, normals_.get())),
       describer_(parameters.descriptor, parameters.grid.resolution_m) {
   Validate(parameters.local_radius_m, parameters.view);
+  if (!(parameters.local_path_m > 0.0)) throw std::invalid_argument("front_end.local_path_m: must be positive");
   Validate(parameters.thinning);
 }
 
@@ -56,6 +58,7 @@ FrontEndStep FrontEnd::Process(const Scan& scan) {
   if (!scan.T_odom_sensor.matrix().allFinite())
     throw std::invalid_argument("the sensor pose of the scan at " + std::to_string(scan.stamp_ns) +
                                 " ns is not finite");
+  if (started_) path_m_ += (scan.T_odom_sensor.translation() - last_T_odom_sensor_.translation()).norm();
   started_ = true;
   last_stamp_ns_ = scan.stamp_ns;
   last_T_odom_sensor_ = scan.T_odom_sensor;
@@ -67,7 +70,8 @@ FrontEndStep FrontEnd::Process(const Scan& scan) {
   GroundFilterResult filtered = ground_filter_.Filter(scan.points_sensor, scan.T_odom_sensor);
   timer.Lap("ground_filter");
 
-  const VoxelUpdate left = grid_.RemoveOutside(scan.T_odom_sensor.translation(), parameters_.local_radius_m);
+  const VoxelUpdate left = 
+      grid_.RemoveOutside(scan.T_odom_sensor.translation(), parameters_.local_radius_m, OldestInsertion());
   timer.Lap("voxel_removal");
   if (normals_) {
     normals_->Remove(left.removed);
@@ -111,6 +115,16 @@ void FrontEnd::ApplyJump(const Pose& T_new_old) {
   T_odom_continuous_ = T_new_old * T_odom_continuous_;
   for (auto& [segment, tracked] : tracked_) tracked.view_position_odom = T_new_old * tracked.view_position_odom;
   jumped_ = true;
+}
+
+/// Of the grid's insertions, the first that is no farther back than local_path_m. Counts the coming one in.
+std::uint32_t FrontEnd::OldestInsertion() {
+  if (!std::isfinite(parameters_.local_path_m)) return 0;
+  while (!insertion_path_m_.empty() && path_m_ - insertion_path_m_.front() > parameters_.local_path_m)
+    insertion_path_m_.pop_front();
+  const std::uint32_t oldest = grid_.insertions() + 1 - static_cast<std::uint32_t>(insertion_path_m_.size());
+  insertion_path_m_.push_back(path_m_);
+  return oldest;
 }
 
 /// What both updates of a step did to segments, in the terms of the table in METHOD 3.

@@ -265,6 +265,8 @@ Parameter Number(const char* key, Access access, const Interval& interval, const
 const std::vector<Parameter>& Table() {
   static const std::vector<Parameter> table{
       NUMBER(front_end.local_radius_m, Above(0), "radius of the local map around the sensor, horizontally"),
+      NUMBER(front_end.local_path_m, OrInfinite(Above(0)),
+             "what was not seen for so much of path leaves the local map too: for small areas that the robot never gets out of"),
       CHOICE(front_end.segmentation,
              "how voxels are grouped: whatever hangs together, or smooth surfaces, for which normals are kept"),
 

@@ -78,8 +78,8 @@ class NeighbourStencil {
 /// Everything is kept in the grid's own frame; T_odom_grid (T_g of the thesis) maps it to the world, so that a rigid
 /// transform of the whole grid (3.1.4) is one matrix product, and a later point still finds its voxel.
 ///
-/// Cost: Insert is O(points), RemoveOutside O(removed + tiles of 3.2 m in the map), Transform O(1), neighbours
-/// O(voxels in the stencil). Not thread-safe.
+/// Cost: Insert is O(points), RemoveOutside O(removed + tiles of 3.2 m in the map), with an oldest insertion O(removed +
+/// blocks), Transform O(1), neighbours O(voxels in the stencil). Not thread-safe.
 class DynamicVoxelGrid {
  public:
   static constexpr int kBlockSide = 4;               ///< cells along a block's side
@@ -97,8 +97,9 @@ class DynamicVoxelGrid {
   /// covered volume are dropped and counted.
   VoxelUpdate Insert(const Points& points_sensor, const Pose& T_odom_sensor);
 
-  /// Removes whole voxels whose centroid is farther than the radius from the centre, measured in the grid's x-y plane.
-  VoxelUpdate RemoveOutside(const Eigen::Vector3d& center_odom, double radius_m);
+  /// Removes whole voxels whose centroid is farther than the radius from the centre, measured in the grid's x-y plane,
+  /// and whole blocks that got no point from the call of Insert on that is counted as oldest_insertion (0: none).
+  VoxelUpdate RemoveOutside(const Eigen::Vector3d& center_odom, double radius_m, std::uint32_t oldest_insertion = 0);
 
   /// Rigid transform of everything: T_g <- T_new_old T_g.
   void Transform(const Pose& T_new_old) { T_odom_grid_ = T_new_old * T_odom_grid_; }
@@ -107,6 +108,8 @@ class DynamicVoxelGrid {
   const Pose& T_odom_grid() const { return T_odom_grid_; }
   /// As given to the constructor.
   const DynamicVoxelGridParameters& parameters() const { return parameters_; }
+  /// How often Insert was called; the last call is counted by this number. O(1).
+  std::uint32_t insertions() const { return insertions_; }
   /// Voxels with enough points. O(1).
   std::size_t active_voxels() const { return active_voxels_; }
   /// Voxels with any point. O(1).
@@ -169,6 +172,7 @@ class DynamicVoxelGrid {
     std::uint64_t occupied = 0;  ///< cells with at least one point
     std::uint64_t active = 0;    ///< cells with at least min_points_per_voxel
     std::uint64_t touched = 0;   ///< cells that got points in the running Insert
+    std::uint32_t last_insertion = 0;  ///< that brought points
     std::array<std::int32_t, 3> coordinates{};
     std::uint32_t tile = 0;
     std::uint32_t position_in_tile = 0;
@@ -211,6 +215,7 @@ class DynamicVoxelGrid {
   std::size_t active_voxels_ = 0;
   std::size_t occupied_voxels_ = 0;
   std::size_t last_moved_ = 0;  ///< in the last Insert
+  std::uint32_t insertions_ = 0;
   std::vector<VoxelHandle> touched_inactive_;  ///< work space of Insert
 };
 

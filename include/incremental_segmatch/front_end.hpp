@@ -2,6 +2,8 @@
 /// Robot side: scan and pose to changed, described segments (METHOD 0 to 4).
 #pragma once
 
+#include <deque>
+#include <limits>
 #include <memory>
 #include <string>
 #include <unordered_map>
@@ -29,6 +31,9 @@ struct ViewParameters {
 struct FrontEndParameters {
   GroundFilterParameters ground;    ///< which points are obstacles
   double local_radius_m = 50.0;     ///< of the local map around the sensor, horizontally
+  /// Of path, for which something stays in it without being seen: so a place that the robot never goes far from can be
+  /// recognised when it comes back.
+  double local_path_m = std::numeric_limits<double>::infinity();
   DynamicVoxelGridParameters grid;  ///< of the local map
   Segmentation segmentation = Segmentation::kEuclidean;  ///< the growing policy
   SegmenterParameters segmenter;    ///< voxels to segments
@@ -113,6 +118,7 @@ class FrontEnd {
   bool IsNewView(const SegmentState& state);
   std::shared_ptr<const Points> SegmentPoints(SegmentId segment, const Eigen::Vector3d& centroid_odom) const;
   SegmentDelta EmptyDelta() const;
+  std::uint32_t OldestInsertion();
 
   FrontEndParameters parameters_;
   std::string robot_;
@@ -128,6 +134,8 @@ class FrontEnd {
   Pose T_odom_continuous_ = Pose::Identity();
   StampNs last_stamp_ns_ = 0;
   Pose last_T_odom_sensor_ = Pose::Identity();
+  double path_m_ = 0.0;
+  std::deque<double> insertion_path_m_;  // of the scans that count for local_path_m, the grid's last insertions
 };
 
 }  // namespace incremental_segmatch

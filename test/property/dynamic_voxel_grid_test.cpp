@@ -36,12 +36,18 @@ struct Reference {
   DynamicVoxelGridParameters parameters;
   Pose T_odom_grid = Pose::Identity();
   std::map<Cell, Content> cells;
+  std::map<Cell, std::uint32_t> last_insertions;  // by block
 
   Cell CellOf(const Eigen::Vector3d& p_grid) const {
     Cell cell;
     for (int axis = 0; axis < 3; ++axis)
       cell[axis] = static_cast<long>(std::floor((p_grid[axis] - parameters.center_m[axis]) / parameters.resolution_m));
     return cell;
+  }
+  static Cell BlockOf(const Cell& cell) {
+    Cell block;
+    for (int axis = 0; axis < 3; ++axis) block[axis] = static_cast<long>(std::floor(cell[axis] / 4.0));
+    return block;
   }
   bool Covers(const Cell& cell) const {
     for (int axis = 0; axis < 3; ++axis) {
@@ -100,11 +106,13 @@ TEST(DynamicVoxelGrid, EqualsMapFromCellToPointsAfterAnySequence) {
         const Eigen::Vector3d odom = reference.T_odom_grid * (center + RandomPose(&random, 2.0).translation());
         const double radius_m = std::uniform_real_distribution<double>(0.5, 4.0)(random);
         const Eigen::Vector3d around = reference.T_odom_grid.inverse() * odom;
-        const VoxelUpdate update = grid.RemoveOutside(odom, radius_m);
+        const std::uint32_t oldest = std::uniform_int_distribution<std::uint32_t>(0, grid.insertions())(random);
+        const VoxelUpdate update = grid.RemoveOutside(odom, radius_m, oldest);
         EXPECT_TRUE(update.activated.empty() && update.moved.empty());
         std::set<Cell> expected;
         for (auto it = reference.cells.begin(); it != reference.cells.end();) {
-          const bool outside = (it->second.Centroid() - around).head<2>().norm() > radius_m;
+          const bool outside = (it->second.Centroid() - around).head<2>().norm() > radius_m ||
+                               reference.last_insertions.at(Reference::BlockOf(it->first)) < oldest;
           if (outside && reference.IsActive(it->second)) expected.insert(it->first);
           it = outside ? reference.cells.erase(it) : std::next(it);
         }
@@ -133,6 +141,7 @@ TEST(DynamicVoxelGrid, EqualsMapFromCellToPointsAfterAnySequence) {
           Reference::Content& content = reference.cells[reference.CellOf(p_grid)];
           content.sum += p_grid;
           ++content.count;
+          reference.last_insertions[Reference::BlockOf(reference.CellOf(p_grid))] = grid.insertions() + 1;
         }
         const VoxelUpdate update = grid.Insert(points, T_odom_sensor);
         EXPECT_TRUE(update.removed.empty());
