@@ -34,6 +34,19 @@ Verdict Judge(const Evidence& evidence, const AcceptanceParameters& parameters) 
   return Verdict::kAccepted;
 }
 
+double Strength(const Evidence& evidence, const AcceptanceParameters& parameters) {
+  constexpr double kUnbound = std::numeric_limits<double>::infinity();
+  const auto at_least = [](double value, double least) { return least > 0.0 ? value / least : kUnbound; };
+  const auto at_most = [](double value, double most) { return value > 0.0 ? most / value : kUnbound; };
+  return std::min(
+      {at_least(static_cast<double>(evidence.inliers), parameters.min_ratio * static_cast<double>(evidence.runner_up)),
+       at_least(evidence.since_twin_m, parameters.twin_memory_m), at_least(evidence.Coverage(), parameters.min_coverage),
+       at_most(evidence.contradiction, parameters.max_contradiction),
+       at_most(evidence.contradiction_once, parameters.max_contradiction_once),
+       at_most(evidence.sigma_m, parameters.max_sigma_m), at_most(evidence.sigma_rad, parameters.max_sigma_rad),
+       at_most(evidence.distance_m, parameters.max_distance_m)});
+}
+
 void Validate(const AcceptanceParameters& parameters) {
   const auto require = [](bool holds, const char* what) {
     if (!holds) throw std::invalid_argument(std::string("back_end.acceptance.") + what);

@@ -66,6 +66,10 @@ bool HasRival(const Evidence& evidence, const AcceptanceParameters& parameters);
 /// Judges the evidence. O(1).
 Verdict Judge(const Evidence& evidence, const AcceptanceParameters& parameters);
 
+/// By what factor the evidence keeps its limits, at the limit where it is smallest: what is demanded over what is there,
+/// or the other way round. At least 1 where Judge accepts, less where it refuses; infinite where no limit binds. O(1).
+double Strength(const Evidence& evidence, const AcceptanceParameters& parameters);
+
 /// Throws std::invalid_argument naming the parameter that is out of range.
 void Validate(const AcceptanceParameters& parameters);
 

@@ -164,6 +164,8 @@ class BackEnd {
 
   /// The target map.
   const TargetMap& map() const { return map_; }
+  /// Which views of it are open to matching, as of the last delta.
+  const TargetIndex& targets() const { return index_; }
   /// As given to the constructor, or changed since.
   const BackEndParameters& parameters() const { return parameters_; }
   /// Memory held, about. O(map).

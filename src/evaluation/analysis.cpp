@@ -88,10 +88,6 @@ std::map<std::string, std::size_t> CountCauses(const std::vector<MissedRevisit>&
   return causes;
 }
 
-double Strength(const Evidence& evidence) {
-  return evidence.Coverage();
-}
-
 std::vector<AcceptancePoint> AcceptanceCurve(const EvaluationResult& result) {
   std::vector<AcceptancePoint> curve;
   if (!result.score) return curve;
@@ -100,8 +96,8 @@ std::vector<AcceptancePoint> AcceptanceCurve(const EvaluationResult& result) {
     const ClosureVerdict verdict = recognition.judged.verdict;
     if (verdict == ClosureVerdict::kTrue || verdict == ClosureVerdict::kFalse) ranked.push_back(&recognition);
   }
-  std::stable_sort(ranked.begin(), ranked.end(), [](const JudgedRecognition* a, const JudgedRecognition* b) {
-    return Strength(a->evidence) > Strength(b->evidence);
+  std::stable_sort(ranked.begin(), ranked.end(), [&](const JudgedRecognition* a, const JudgedRecognition* b) {
+    return Strength(a->evidence, result.acceptance) > Strength(b->evidence, result.acceptance);
   });
   std::size_t true_ones = 0;
   std::set<std::size_t> found;
@@ -110,8 +106,8 @@ std::vector<AcceptancePoint> AcceptanceCurve(const EvaluationResult& result) {
     true_ones += judged.verdict == ClosureVerdict::kTrue;
     if (judged.verdict == ClosureVerdict::kTrue && result.score->revisit_targets[judged.query_step])
       found.insert(judged.query_step);
-    const double strength = Strength(ranked[i]->evidence);
-    if (i + 1 < ranked.size() && Strength(ranked[i + 1]->evidence) == strength) continue;
+    const double strength = Strength(ranked[i]->evidence, result.acceptance);
+    if (i + 1 < ranked.size() && Strength(ranked[i + 1]->evidence, result.acceptance) == strength) continue;
     AcceptancePoint point;
     point.threshold = strength;
     point.accepted = i + 1;

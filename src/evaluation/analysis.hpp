@@ -28,12 +28,9 @@ std::vector<MissedRevisit> FindMissedRevisits(const EvaluationResult& result);
 /// How many were missed for which cause.
 std::map<std::string, std::size_t> CountCauses(const std::vector<MissedRevisit>& missed);
 
-/// The evidence as one number, by which the acceptance curve ranks recognitions: the coverage.
-double Strength(const Evidence& evidence);
-
-/// What acceptance by strength alone, from a threshold on, would give.
+/// What acceptance from some strength on would give; the run itself accepts from 1 on.
 struct AcceptancePoint {
-  double threshold = 0.0;
+  double threshold = 0.0;    ///< a strength; infinite where nothing speaks against a recognition
   std::size_t accepted = 0;  ///< true and false
   double precision = 0.0;
   double recall = 0.0;  ///< share of the revisits that have a true recognition

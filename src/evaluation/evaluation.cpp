@@ -188,6 +188,13 @@ EvaluationResult Evaluate(DriveSource& drive, const EvaluationParameters& parame
   result.notes = drive.notes();
   result.odometry_is_truth = drive.odometry_is_truth();
   result.min_clique = parameters.core.back_end.recognizer.clique.min_size;
+  result.acceptance = parameters.core.back_end.acceptance;
+  if (steps > 0) result.truth = ReadTruth(drive, steps);
+  result.map_truth = parameters.map_truth;
+  const bool is_scored = result.truth && (parameters.map_file.empty() || result.map_truth);
+  std::optional<TruePairFinder> true_pairs;
+  if (is_scored)
+    true_pairs.emplace(*result.truth, result.map_truth ? &*result.map_truth : nullptr, parameters.scoring);
 
   for (std::size_t i = 0; i < steps; ++i) {
     StepRecord record;
@@ -201,6 +208,10 @@ EvaluationResult Evaluate(DriveSource& drive, const EvaluationParameters& parame
     BackEndStep recognized = back_end.Process(seen.delta);
     record.total_ms = ThreadCpuMs() - step_start_ms;
 
+    if (true_pairs) {
+      const std::vector<TruePair> pairs = true_pairs->Step(i, seen.delta, recognized, back_end);
+      result.true_pairs.insert(result.true_pairs.end(), pairs.begin(), pairs.end());
+    }
     if (parameters.pipeline == Pipeline::kBoth)
       record.batch = comparison.Run(seen, recognized, scan.T_odom_sensor);
     record.stages = std::move(seen.times);
@@ -233,13 +244,11 @@ EvaluationResult Evaluate(DriveSource& drive, const EvaluationParameters& parame
     result.optimized = closer.Trajectory();
     result.pose_graph = closer.TakeGraph();
   }
-  if (steps > 0) result.truth = ReadTruth(drive, steps);
   if (!parameters.save_map.empty()) {
     if (optimize) back_end.CorrectTrajectory(parameters.robot, result.optimized);
     SaveMap(back_end.map(), result.truth, parameters.save_map);
   }
-  result.map_truth = parameters.map_truth;
-  if (result.truth && (parameters.map_file.empty() || result.map_truth)) ScoreResult(parameters.scoring, &result);
+  if (is_scored) ScoreResult(parameters.scoring, &result);
   if (result.score && optimize) result.trajectory_error = MeasureErrors(result, parameters.pose_graph);
   if (!parameters.map_file.empty() && !result.map_truth)
     result.notes.push_back("the truth of the map's drive is not known: nothing is scored");

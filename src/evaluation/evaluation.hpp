@@ -12,6 +12,7 @@
 #include "evaluation/drive_source.hpp"
 #include "evaluation/scoring.hpp"
 #include "evaluation/trajectory_error.hpp"
+#include "evaluation/true_pairs.hpp"
 #include "incremental_segmatch/parameters.hpp"
 #include "incremental_segmatch/pose_graph.hpp"
 
@@ -82,6 +83,7 @@ struct EvaluationResult {
   std::vector<ClosureRow> closures;             ///< accepted recognitions
   std::vector<JudgedRecognition> recognitions;  ///< all that were judged
   std::size_t min_clique = 0;                   ///< T: smaller consistent sets are no recognition
+  AcceptanceParameters acceptance;              ///< what recognitions were judged by
   std::vector<GraphClosure> graph_closures;     ///< those that entered the pose graph
   std::vector<StampedPose> odometry;
   std::vector<StampedPose> optimized;   ///< equal to the odometry without optimization
@@ -91,6 +93,7 @@ struct EvaluationResult {
   std::optional<TrueTrajectory> truth;               ///< where there is ground truth
   std::optional<TrueTrajectory> map_truth;           ///< of the map's drive, in localization, where it is known
   std::optional<Score> score;                        ///< where there is ground truth
+  std::vector<TruePair> true_pairs;                  ///< at revisits, where there is ground truth
   std::optional<TrajectoryErrors> trajectory_error;  ///< where there is ground truth and optimization
 };
 

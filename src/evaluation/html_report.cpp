@@ -320,26 +320,30 @@ std::string Stages(const EvaluationResult& result) {
 }
 
 std::string Acceptance(const EvaluationResult& result) {
-  const std::vector<AcceptancePoint> curve = AcceptanceCurve(result);
+  std::vector<AcceptancePoint> curve = AcceptanceCurve(result);
+  curve.erase(std::remove_if(curve.begin(), curve.end(),
+                             [](const AcceptancePoint& point) { return std::isinf(point.threshold); }),
+              curve.end());
   if (curve.size() < 2) return {};
   Plot plot;
   plot.title = "Precision and recall over the acceptance threshold";
-  plot.x_label = "least coverage that is accepted";
+  plot.x_label = "least strength that is accepted";
   plot.y_label = "share";
   Curve precision{"precision", "c-true", {}}, recall{"recall", "c-blue", {}};
   for (auto point = curve.rbegin(); point != curve.rend(); ++point) {
     precision.points.emplace_back(point->threshold, point->precision);
     if (!std::isnan(point->recall)) recall.points.emplace_back(point->threshold, point->recall);
-    plot.x_max = std::max(1.0, point->threshold);
+    plot.x_max = std::max(1.5, point->threshold);
   }
   plot.curves = {precision, recall};
+  plot.x_marks = {{1.0, "as run"}};
   return Heading("What another threshold would give") +
          Figure(Draw(plot),
                 Count(result.recognitions.size()) + " recognitions came as far as to be judged, " +
                     Count(result.closures.size()) +
-                    " were accepted. Here all of them are judged by one number: the share of the segments in view "
-                    "that have a counterpart in the map under the recognised pose. The run itself weighs more than "
-                    "that: precision " +
+                    " were accepted. The strength of a recognition is by what factor its evidence keeps the limits of "
+                    "acceptance, at that limit where the factor is smallest: 1 and more is accepted, and a threshold "
+                    "of 2 stands for limits that are all twice as strict. As run: precision " +
                     FormatNumber(result.score->precision, "%.4f") + ", recall " +
                     FormatNumber(result.score->recall, "%.3f") + ".");
 }
@@ -415,6 +419,58 @@ std::string Funnel(const EvaluationResult& result) {
          HtmlTable(table);
 }
 
+// Where segments that were seen before are lost.
+std::string TruePairs(const EvaluationResult& result) {
+  if (!result.score || result.true_pairs.empty()) return {};
+  const TruePairStatistics statistics = MeasureTruePairs(result.true_pairs);
+  Plot plot;
+  plot.title = "Rank of the true target";
+  plot.x_label = "rank of the true target among all open ones, by descriptor distance";
+  plot.y_label = "share of the pairs with at most that rank";
+  plot.x_max = std::max(25.0, statistics.rank_90);
+  std::vector<double> ranks;
+  for (const TruePair& pair : result.true_pairs)
+    if (pair.allowed) ranks.push_back(static_cast<double>(pair.rank));
+  std::sort(ranks.begin(), ranks.end());
+  Curve curve{"", "c-blue", {}};
+  for (std::size_t i = 0; i < ranks.size() && ranks[i] <= plot.x_max; ++i) {
+    if (i + 1 < ranks.size() && ranks[i + 1] == ranks[i]) continue;
+    curve.points.emplace_back(ranks[i], static_cast<double>(i + 1) / static_cast<double>(ranks.size()));
+  }
+  plot.curves = {curve};
+  const auto kept = [](const char* filter, double share) {
+    return Tagged(std::string("/true_pairs/kept/") + filter, share, "%.3f");
+  };
+  std::vector<std::vector<std::string>> table{
+      {"true pairs", ""},
+      {"their target is open to matching", kept("allowed", statistics.kept_allowed)},
+      {"and among the nearest that are taken", kept("nearest", statistics.kept_nearest)},
+      {"and within the largest distance, if one is set", kept("max_distance", statistics.kept_within)},
+      {"in the consistent set of the step's recognition", kept("consistent", statistics.kept_consistent)}};
+  for (const auto& [rank, share] : statistics.share_within_rank) {
+    table.push_back({"target among the first " + Count(rank) + " of those that are open",
+                     Tagged("/true_pairs/share_within_rank/" + Count(rank), share, "%.3f")});
+  }
+  const auto metres = [](const char* which, double value) {
+    return Tagged(std::string("/true_pairs/centroid_difference_m/") + which, value, "%.2f") + " m";
+  };
+  table.push_back({"centroids differ by, median and 90 %", metres("median", statistics.centroid_difference_median_m) +
+                                                                ", " +
+                                                                metres("p90", statistics.centroid_difference_90_m)});
+  table.push_back({"voxels of the smaller over the larger, median, and a tenth is below",
+                   Tagged("/true_pairs/size_ratio/median", statistics.size_ratio_median, "%.2f") + ", " +
+                       Tagged("/true_pairs/size_ratio/p10", statistics.size_ratio_10, "%.2f")});
+  return Heading("Segments seen before") +
+         Paragraph(Tagged("/true_pairs/pairs", statistics.pairs) + " local segments of " +
+                   Tagged("/true_pairs/steps", statistics.steps) +
+                   " revisits have a target: a segment of the map whose centroid lies within 1 m of theirs, both "
+                   "placed by the true poses of the scans that they were seen from, and which was seen long enough "
+                   "ago. Its rank is " +
+                   Tagged("/true_pairs/rank/median", statistics.rank_median, "%.0f") + " in the median, at 90 % " +
+                   Tagged("/true_pairs/rank/p90", statistics.rank_90, "%.0f") + ".") +
+         Figure(Draw(plot), "The nearer to the upper left corner, the better the descriptor.") + HtmlTable(table);
+}
+
 std::string Thesis(const EvaluationResult& result) {
   std::vector<std::vector<std::string>> table{{"", "this run", "thesis"}};
   for (const ThesisFigure& figure : CompareWithThesis(result))
@@ -471,7 +527,7 @@ std::string ReportHtml(const EvaluationResult& result) {
     body += Gaps(*result.score);
     body += Misses(result, stretches);
   }
-  body += Funnel(result) + Acceptance(result) + Errors(result) + Stages(result) + Thesis(result);
+  body += Funnel(result) + TruePairs(result) + Acceptance(result) + Errors(result) + Stages(result) + Thesis(result);
   return HtmlPage(result.drive, body);
 }
 

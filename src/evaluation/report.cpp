@@ -129,6 +129,23 @@ Json ScoreJson(const Score& score) {
         {"share_within_1_5_m", ShareWithin(score.gaps_m, 1.5)}}}};
 }
 
+Json TruePairsJson(const TruePairStatistics& statistics) {
+  Json within_rank = Json::object();
+  for (const auto& [rank, share] : statistics.share_within_rank) within_rank[std::to_string(rank)] = share;
+  return {{"pairs", statistics.pairs},
+          {"steps", statistics.steps},
+          {"rank", {{"median", statistics.rank_median}, {"p90", statistics.rank_90}}},
+          {"share_within_rank", within_rank},
+          {"kept",
+           {{"allowed", statistics.kept_allowed},
+            {"nearest", statistics.kept_nearest},
+            {"max_distance", statistics.kept_within},
+            {"consistent", statistics.kept_consistent}}},
+          {"centroid_difference_m",
+           {{"median", statistics.centroid_difference_median_m}, {"p90", statistics.centroid_difference_90_m}}},
+          {"size_ratio", {{"median", statistics.size_ratio_median}, {"p10", statistics.size_ratio_10}}}};
+}
+
 // At most about a hundred points of the curve, both ends included.
 Json AcceptanceJson(const std::vector<AcceptancePoint>& curve) {
   Json points = Json::array();
@@ -175,6 +192,24 @@ std::string FormatScore(const Score& score) {
   return text;
 }
 
+std::string FormatTruePairs(const TruePairStatistics& statistics) {
+  if (statistics.pairs == 0) return "true pairs          none\n";
+  std::string text = Format("true pairs          %zu segments seen before, in %zu steps; target ranks ",
+                            statistics.pairs, statistics.steps) +
+                     Number(statistics.rank_median, "%.0f") + " in the median, 90 % " +
+                     Number(statistics.rank_90, "%.0f") + "\n  target among first";
+  for (const auto& [rank, share] : statistics.share_within_rank)
+    text += Format(" %zu: ", rank) + Number(share, "%.3f");
+  text += "\n  kept              allowed " + Number(statistics.kept_allowed, "%.3f") + ", nearest " +
+          Number(statistics.kept_nearest, "%.3f") + ", max_distance " + Number(statistics.kept_within, "%.3f") +
+          ", consistent " + Number(statistics.kept_consistent, "%.3f");
+  text += "\n  centroids differ  by " + Number(statistics.centroid_difference_median_m, "%.2f m") +
+          " in the median, 90 % " + Number(statistics.centroid_difference_90_m, "%.2f m") + "; size ratio " +
+          Number(statistics.size_ratio_median, "%.2f") + ", a tenth below " +
+          Number(statistics.size_ratio_10, "%.2f") + "\n";
+  return text;
+}
+
 std::string FormatErrors(const TrajectoryErrors& errors) {
   std::string text = Format("trajectory error    %.3f m before, %.3f m after\n", errors.odometry_m, errors.optimized_m);
   text += Format("  bound             %.3f m with true closures at the same places, %.3f m at every revisit\n",
@@ -203,6 +238,7 @@ std::string SummaryJson(const EvaluationResult& result) {
                                   {"bound_same_places", errors.bound_same_places_m},
                                   {"bound_every_revisit", errors.bound_every_revisit_m}};
   }
+  json["true_pairs"] = result.score ? TruePairsJson(MeasureTruePairs(result.true_pairs)) : Json();
   json["missed_revisits_by"] = CountCauses(FindMissedRevisits(result));
   json["acceptance_curve"] = AcceptanceJson(AcceptanceCurve(result));
   for (const ThesisFigure& figure : CompareWithThesis(result)) json["thesis_figures"][figure.key] = figure.ours;
@@ -238,6 +274,7 @@ std::string FormatSummary(const EvaluationResult& result) {
   text += Format("\nrecognitions        %zu accepted, %zu entered the pose graph, %zu outvoted there\n",
                  result.closures.size(), result.graph_closures.size(), result.last_optimization.outvoted_closures);
   text += result.score ? FormatScore(*result.score) : "no ground truth: nothing is scored\n";
+  if (result.score) text += FormatTruePairs(MeasureTruePairs(result.true_pairs));
   if (result.trajectory_error) text += FormatErrors(*result.trajectory_error);
   text += "steps ended by     ";
   for (const auto& [end, count] : CountEnds(result.steps)) text += " " + end + Format(" %zu", count);

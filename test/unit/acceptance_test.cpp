@@ -2,7 +2,10 @@
 
 #include <gtest/gtest.h>
 
+#include <limits>
+#include <random>
 #include <stdexcept>
+#include <string>
 
 namespace incremental_segmatch {
 namespace {
@@ -39,6 +42,55 @@ TEST(Acceptance, EachPartOfTheEvidenceCanRefuse) {
   EXPECT_EQ(judge([](Evidence& e) { e.sigma_m = 0.6; }), Verdict::kUncertain);
   EXPECT_EQ(judge([](Evidence& e) { e.sigma_rad = 0.03; }), Verdict::kUncertain);
   EXPECT_EQ(judge([](Evidence& e) { e.distance_m = 21.0; }), Verdict::kTooFar);
+}
+
+TEST(Acceptance, StrengthIsTheSmallestFactorByWhichALimitIsKept) {
+  const AcceptanceParameters parameters;
+  Evidence evidence = Good();
+  evidence.contradiction = 0.03;  // half of what is allowed; coverage and the sigmas are farther from theirs
+  EXPECT_DOUBLE_EQ(Strength(evidence, parameters), 2.0);
+  evidence.runner_up = 8;
+  EXPECT_DOUBLE_EQ(Strength(evidence, parameters), 20.0 / 14.0);
+  evidence.since_twin_m = 25.0;
+  EXPECT_DOUBLE_EQ(Strength(evidence, parameters), 0.25);
+  AcceptanceParameters lax;
+  lax.min_coverage = lax.twin_memory_m = 0.0;
+  EXPECT_EQ(Strength(Evidence(), lax), std::numeric_limits<double>::infinity());
+}
+
+TEST(Acceptance, StrengthOfOneDividesWhatIsAcceptedFromWhatIsRefused) {
+  for (unsigned seed = 1; seed <= 5; ++seed) {
+    SCOPED_TRACE("seed " + std::to_string(seed));
+    std::mt19937 random(seed);
+    std::uniform_real_distribution<double> uniform(0.0, 1.0);
+    const auto chance = [&](double share) { return uniform(random) < share; };
+    // Mostly within its limit, and often at it.
+    const auto around = [&](double limit) {
+      return chance(0.2) ? limit : chance(0.1) ? 0.0 : limit * (chance(0.9) ? uniform(random) : 2.0 * uniform(random));
+    };
+    std::size_t accepted = 0, refused = 0;
+    for (int i = 0; i < 2000; ++i) {
+      AcceptanceParameters parameters;
+      if (chance(0.1)) parameters.min_coverage = 0.0;
+      if (chance(0.1)) parameters.twin_memory_m = 0.0;
+      Evidence evidence;
+      evidence.inliers = 6 + random() % 30;
+      evidence.runner_up = random() % (chance(0.1) ? 20 : 4);
+      evidence.expected = random() % 40;
+      evidence.supported = chance(0.9) ? evidence.expected : random() % (evidence.expected + 1);
+      if (chance(0.1)) evidence.since_twin_m = 2.0 * parameters.twin_memory_m * uniform(random);
+      evidence.contradiction = around(parameters.max_contradiction);
+      evidence.contradiction_once = around(parameters.max_contradiction_once);
+      evidence.sigma_m = around(parameters.max_sigma_m);
+      evidence.sigma_rad = around(parameters.max_sigma_rad);
+      evidence.distance_m = around(parameters.max_distance_m);
+      const bool accepts = Judge(evidence, parameters) == Verdict::kAccepted;
+      EXPECT_EQ(Strength(evidence, parameters) >= 1.0, accepts) << "evidence " << i;
+      ++(accepts ? accepted : refused);
+    }
+    EXPECT_GT(accepted, 300u);
+    EXPECT_GT(refused, 300u);
+  }
 }
 
 TEST(Acceptance, CoverageCountsSegmentsWhereTheMapWasSeen) {

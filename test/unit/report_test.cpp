@@ -56,11 +56,23 @@ EvaluationResult RandomResult(unsigned seed) {
       row.stamp_query_ns = stamp_ns;
       row.stamp_target_ns = stamp_ns - StampNs{300000000} * kPerLap;
       row.T_target_query.translation().x() = uniform(random) < 0.2 ? 3.0 : 0.3 * uniform(random);
-      const bool accepted = evidence.supported >= 10;
+      evidence.contradiction = 0.08 * uniform(random);
+      const bool accepted = Judge(evidence, result.acceptance) == Verdict::kAccepted;
       step.back_end.evidence = evidence;
       step.back_end.end = accepted ? StepEnd::kRecognized : StepEnd::kUncovered;
       result.recognitions.push_back({static_cast<std::size_t>(i), row, evidence, step.back_end.end, {}});
       if (accepted) result.closures.push_back(row);
+    }
+    if (i >= kPerLap) {
+      TruePair pair;
+      pair.step = static_cast<std::size_t>(i);
+      pair.centroid_difference_m = uniform(random);
+      pair.size_ratio = uniform(random);
+      pair.allowed = uniform(random) < 0.9;
+      pair.rank = pair.allowed ? 1 + random() % 200 : 0;
+      pair.nearest = pair.within = pair.allowed && pair.rank <= 25;
+      pair.consistent = pair.nearest && uniform(random) < 0.5;
+      result.true_pairs.push_back(pair);
     }
     result.steps.push_back(step);
   }
@@ -102,19 +114,31 @@ TEST(Analysis, EveryMissedRevisitHasItsCause) {
   }
 }
 
+TEST(Analysis, AcceptanceCurveHasTheRunItselfAtAStrengthOfOne) {
+  const EvaluationResult result = RandomResult(1);
+  const std::vector<AcceptancePoint> curve = AcceptanceCurve(result);
+  const auto as_run = std::find_if(curve.rbegin(), curve.rend(),
+                                   [](const AcceptancePoint& point) { return point.threshold >= 1.0; });
+  ASSERT_NE(as_run, curve.rend());
+  EXPECT_EQ(as_run->accepted, result.closures.size());
+  EXPECT_DOUBLE_EQ(as_run->precision, result.score->precision);
+  EXPECT_DOUBLE_EQ(as_run->recall, result.score->recall);
+  EXPECT_GT(curve.back().accepted, result.closures.size()) << "refused recognitions belong to the curve";
+}
+
 TEST(Analysis, AcceptanceCurveEqualsAcceptingAnewAtEveryThreshold) {
   for (unsigned seed = 1; seed <= 5; ++seed) {
     SCOPED_TRACE("seed " + std::to_string(seed));
     const EvaluationResult result = RandomResult(seed);
     const std::vector<AcceptancePoint> curve = AcceptanceCurve(result);
     std::set<double> strengths;
-    for (const JudgedRecognition& recognition : result.recognitions) strengths.insert(Strength(recognition.evidence));
+    for (const JudgedRecognition& recognition : result.recognitions) strengths.insert(Strength(recognition.evidence, result.acceptance));
     ASSERT_EQ(curve.size(), strengths.size());
     ASSERT_GT(curve.size(), 5u);
     for (const AcceptancePoint& point : curve) {
       std::vector<ClosureRow> accepted;
       for (const JudgedRecognition& recognition : result.recognitions) {
-        if (Strength(recognition.evidence) >= point.threshold) accepted.push_back(recognition.closure);
+        if (Strength(recognition.evidence, result.acceptance) >= point.threshold) accepted.push_back(recognition.closure);
       }
       const Score score = ScoreClosures(*result.truth, accepted, {});
       EXPECT_EQ(point.accepted, accepted.size());
