@@ -10,8 +10,7 @@
 namespace incremental_segmatch {
 namespace {
 
-constexpr std::size_t kShownPoints = 300;  // of a segment
-constexpr double kLabelHeight_m = 1.0;     // over the centroid
+constexpr double kLabelHeight_m = 1.0;  // over the centroid
 
 std_msgs::ColorRGBA ToColour(std::uint32_t rgb, float alpha = 1.f) {
   std_msgs::ColorRGBA colour;
@@ -40,17 +39,14 @@ visualization_msgs::Marker DeleteAll(const std_msgs::Header& header) {
   return marker;
 }
 
-/// A view's points in the map, at most kShownPoints of them; its centroid where it has none.
+/// A view's points in the map; its centroid where it has none.
 std::vector<Eigen::Vector3d> ViewPoints(const TargetMap& map, const SegmentView& view, double height_m) {
   const Eigen::Vector3d centroid = map.CentroidMap(view) + height_m * Eigen::Vector3d::UnitZ();
   if (!view.points_centroid) return {centroid};
   const TrajectoryPose& pose = map.PoseOf(view);
   const Eigen::Matrix3d R_map_odom = pose.T_map_sensor.linear() * pose.T_odom_sensor.linear().transpose();
-  const Points& points = *view.points_centroid;
-  const std::size_t stride = points.size() / kShownPoints + 1;
   std::vector<Eigen::Vector3d> shown;
-  for (std::size_t i = 0; i < points.size(); i += stride)
-    shown.push_back(centroid + R_map_odom * points[i].cast<double>());
+  for (const Eigen::Vector3f& p : *view.points_centroid) shown.push_back(centroid + R_map_odom * p.cast<double>());
   return shown;
 }
 

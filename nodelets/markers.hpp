@@ -65,7 +65,7 @@ visualization_msgs::MarkerArray HistoryMarkers(const TargetMap& map, const Segme
                                                const std_msgs::Header& header);
 
 /// A cloud of the map's segments, coloured by segment, `height_m` above their place. Of each the newest view that has
-/// points, a few hundred of them; its centroid where no view has any. O(map).
+/// points; its centroid where no view has any. O(map).
 sensor_msgs::PointCloud2 TargetCloud(const TargetMap& map, double height_m, const std_msgs::Header& header);
 
 }  // namespace incremental_segmatch

@@ -35,7 +35,7 @@ struct FrontEndNodeParameters {
   bool frame_jumps = false;              ///< odom_frame jumps at corrections: follow the topic `trajectory`
   FrameKind trajectory_kind = FrameKind::kBase;  ///< whose poses `trajectory` holds: `base` or `sensor`
   int queue_size = 5;                            ///< clouds; when full, the oldest goes
-  bool send_points = true;                       ///< of new views of segments, for refinement
+  bool send_points = true;                       ///< the thinned scan, for refinement, and of new views those that are shown
 };
 
 /// Of BackEndNodelet.

@@ -13,11 +13,13 @@ namespace {
 constexpr double kDuplicateDistanceM = 1.0;
 
 std::shared_ptr<const Points> PointsOf(const std::vector<std::int32_t>& cluster, const Points& cloud,
-                                       const Eigen::Vector3d& centroid) {
+                                       const Eigen::Vector3d& centroid, std::size_t shown_points) {
+  if (shown_points == 0) return nullptr;
+  const std::size_t stride = ShownStride(cluster.size(), shown_points);
   auto points = std::make_shared<Points>();
-  points->reserve(cluster.size());
   const Eigen::Vector3f origin = centroid.cast<float>();
-  for (const std::int32_t index : cluster) points->push_back(cloud[static_cast<std::size_t>(index)] - origin);
+  for (std::size_t i = 0; i < cluster.size(); i += stride)
+    points->push_back(cloud[static_cast<std::size_t>(cluster[i])] - origin);
   return points;
 }
 
@@ -79,7 +81,10 @@ RecognizerResult BatchRecognizer::Recognize(const Correspondences& correspondenc
 }
 
 BatchFrontEnd::BatchFrontEnd(const FrontEndParameters& parameters, const RecognizerParameters& recognizer, std::string robot)
-    : robot_(std::move(robot)), ground_filter_(parameters.ground), baseline_(BatchParametersOf(parameters, recognizer)) {}
+    : robot_(std::move(robot)),
+      ground_filter_(parameters.ground),
+      baseline_(BatchParametersOf(parameters, recognizer)),
+      shown_points_(parameters.view.shown_points) {}
 
 FrontEndStep BatchFrontEnd::Process(const Scan& scan) {
   FrontEndStep step;
@@ -105,7 +110,7 @@ FrontEndStep BatchFrontEnd::Process(const Scan& scan) {
     state.centroid_odom = segment.centroid_odom;
     state.descriptor = segment.descriptor;
     state.new_view = true;
-    state.points_centroid = PointsOf(segment.cluster, cloud, segment.centroid_odom);
+    state.points_centroid = PointsOf(segment.cluster, cloud, segment.centroid_odom, shown_points_);
     delta.changed.push_back(std::move(state));
   }
   for (const SegmentState& last : last_) {

@@ -27,6 +27,15 @@ void Validate(double local_radius_m, const ViewParameters& view) {
   if (!(view.baseline_m > 0.0)) throw std::invalid_argument("front_end.view.baseline_m: must be positive");
 }
 
+/// Every so many of the voxels that got points: enough to see what a segment looks like.
+std::vector<VoxelHandle> VoxelsSeen(const VoxelUpdate& update) {
+  constexpr std::size_t kStride = 4;
+  std::vector<VoxelHandle> seen;
+  for (std::size_t i = 0; i < update.moved.size(); i += kStride) seen.push_back(update.moved[i].voxel);
+  for (std::size_t i = 0; i < update.activated.size(); i += kStride) seen.push_back(update.activated[i]);
+  return seen;
+}
+
 }  // namespace
 
 FrontEnd::FrontEnd(const FrontEndParameters& parameters, std::string robot)
@@ -90,6 +99,7 @@ FrontEndStep FrontEnd::Process(const Scan& scan) {
   timer.Lap("segmentation");
 
   step.delta = DescribeChanges(left_segments, grown_segments);
+  ShowViews(VoxelsSeen(inserted), &step.delta);
   timer.Lap("description");
 
   step.delta.scan_sensor = std::make_shared<const Points>(ThinScan(scan.points_sensor, parameters_.thinning));
@@ -149,7 +159,6 @@ SegmentDelta FrontEnd::DescribeChanges(const SegmentUpdate& left, const SegmentU
   for (const SegmentId segment : changed) {
     SegmentState state = DescribeSegment(segment);
     state.new_view = IsNewView(state);
-    if (state.new_view) state.points_centroid = SegmentPoints(segment, state.centroid_odom);
     delta.changed.push_back(std::move(state));
   }
   return delta;
@@ -175,12 +184,27 @@ bool FrontEnd::IsNewView(const SegmentState& state) {
   return is_new;
 }
 
-std::shared_ptr<const Points> FrontEnd::SegmentPoints(SegmentId segment, const Eigen::Vector3d& centroid_odom) const {
-  const std::vector<VoxelHandle> voxels = segmenter_->Voxels(segment);
-  auto points = std::make_shared<Points>();
-  points->reserve(voxels.size());
-  for (const VoxelHandle voxel : voxels) points->push_back((grid_.CentroidOdom(voxel) - centroid_odom).cast<float>());
-  return points;
+/// New views show those of the voxels that belong to them, thinned.
+void FrontEnd::ShowViews(const std::vector<VoxelHandle>& voxels, SegmentDelta* delta) const {
+  const std::size_t most = parameters_.view.shown_points;
+  if (most == 0) return;
+  std::unordered_map<SegmentId, std::vector<VoxelHandle>> shown;
+  for (const SegmentState& state : delta->changed)
+    if (state.new_view) shown.emplace(state.id, std::vector<VoxelHandle>());
+  if (shown.empty()) return;
+  for (const VoxelHandle voxel : voxels) {
+    const auto view = shown.find(segmenter_->SegmentOf(voxel));
+    if (view != shown.end()) view->second.push_back(voxel);
+  }
+  for (SegmentState& state : delta->changed) {
+    if (!state.new_view) continue;
+    const std::vector<VoxelHandle>& seen = shown.at(state.id);
+    auto points = std::make_shared<Points>();
+    points->reserve(std::min(most, seen.size()));
+    for (std::size_t i = 0; i < seen.size(); i += ShownStride(seen.size(), most))
+      points->push_back((grid_.CentroidOdom(seen[i]) - state.centroid_odom).cast<float>());
+    state.points_centroid = std::move(points);
+  }
 }
 
 SegmentDelta FrontEnd::EmptyDelta() const {
@@ -199,9 +223,9 @@ SegmentDelta FrontEnd::FullState() const {
   for (const SegmentId segment : segmenter_->Segments()) {
     SegmentState state = DescribeSegment(segment);
     state.new_view = true;
-    state.points_centroid = SegmentPoints(segment, state.centroid_odom);
     delta.changed.push_back(std::move(state));
   }
+  ShowViews(grid_.ActiveVoxels(), &delta);
   return delta;
 }
 

@@ -26,38 +26,26 @@ SegmentUpdate IncrementalSegmenter<Policy>::Remove(const std::vector<RemovedVoxe
   for (const RemovedVoxel& gone : removed) {
     BlockOf(gone.voxel).pending &= ~CellBit(gone.voxel);
     if (!IsClustered(gone.voxel)) continue;
-    VoxelNode& node = voxels_[gone.voxel];
-    Cluster& cluster = ClusterAt(FindRoot(node.label));
+    Cluster& cluster = ClusterAt(FindRoot(LabelOf(gone.voxel)));
     --cluster.live_voxels;
-    if (cluster.live_voxels == 0) {
-      cluster.first = kEnd;
-    } else {
-      voxels_[node.previous].next = node.next;
-      voxels_[node.next].previous = node.previous;
-      if (cluster.first == gone.voxel) cluster.first = node.next;
-    }
-    if (parameters_.boundary == BoundaryPolicy::kInvalidate) {
+    if (cluster.live_voxels == 0) MarkDirty(&cluster);
+    if (parameters_.boundary == BoundaryPolicy::kInvalidate && cluster.state != State::kTooLarge) {
       cluster.moments.Subtract(PointOf(gone.voxel, gone.centroid_block));
-      if (cluster.state != State::kTooLarge) SetState(&cluster, State::kCut);
-      MarkDirty(&cluster);
-    } else if (cluster.live_voxels == 0) {
+      SetState(&cluster, State::kCut);
       MarkDirty(&cluster);
     }
     BlockNode& block = BlockOf(gone.voxel);
     block.clustered &= ~CellBit(gone.voxel);
-    if (block.clustered == 0) SetBlockLabel(&block, kNoLabel);
-    Release(node.label);
-    node = VoxelNode();
+    if (block.label == kMixed) Release(labels_[gone.voxel]);
+    if (block.clustered == 0) SetLabel(&block.label, kNoLabel);
   }
   return Settle();
 }
 
 template <class Policy>
 SegmentUpdate IncrementalSegmenter<Policy>::Insert(const VoxelUpdate& update) {
-  if (voxels_.size() < grid_->handle_capacity()) {
-    voxels_.resize(grid_->handle_capacity());
-    blocks_.resize(voxels_.size() / DynamicVoxelGrid::kCellsPerBlock);
-  }
+  labels_.Grow(grid_->handle_capacity());
+  blocks_.Grow(labels_.size() / DynamicVoxelGrid::kCellsPerBlock);
   FollowCentroids(update.moved);
   for (const VoxelHandle voxel : update.activated) BlockOf(voxel).pending |= CellBit(voxel);
   seeds_ = update.activated;
@@ -86,7 +74,8 @@ void IncrementalSegmenter<Policy>::FollowCentroids(const std::vector<MovedVoxel>
       root = block->label < kMixed ? FindRoot(block->label) : kNoLabel;
     }
     if ((block->clustered & CellBit(moved.voxel)) == 0) continue;
-    Cluster& cluster = ClusterAt(root != kNoLabel ? root : FindRoot(voxels_[moved.voxel].label));
+    Cluster& cluster = ClusterAt(root != kNoLabel ? root : FindRoot(labels_[moved.voxel]));
+    if (cluster.state == State::kTooLarge) continue;
     cluster.moments.Move(corner + moved.before_block.cast<double>(), corner + moved.after_block.cast<double>());
     cluster.grew = true;
     MarkDirty(&cluster);
@@ -115,7 +104,6 @@ void IncrementalSegmenter<Policy>::GrowFromSeed(VoxelHandle seed) {
 
 template <class Policy>
 void IncrementalSegmenter<Policy>::Queue(VoxelHandle voxel) {
-  voxels_[voxel].label = kQueued;
   BlockOf(voxel).pending &= ~CellBit(voxel);
   queue_.push_back(voxel);
 }
@@ -129,8 +117,9 @@ typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::Meet(
 template <class Policy>
 typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::VisitNeighbours(VoxelHandle from, Label root) {
   grid_->ForEachNeighbour(stencil_, from, [&](VoxelHandle to, const Eigen::Vector3f&) {
-    const Label label = voxels_[to].label;
-    if (label == kQueued) return true;
+    const bool pending = (BlockOf(to).pending & CellBit(to)) != 0;
+    if (!pending && !IsClustered(to)) return true;  // queued
+    const Label label = pending ? kNoLabel : LabelOf(to);
     if (label != kNoLabel && root != kNoLabel && FindRoot(label) == root) return true;  // spares asking the policy
     if (!policy_.CanPointBeSeed(to)) {
       if (label == kNoLabel) rough_.push_back(to);  // looked at once all regions have grown
@@ -151,15 +140,16 @@ typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::Visit
 /// does not matter.
 template <class Policy>
 void IncrementalSegmenter<Policy>::JoinFlattestCluster(VoxelHandle voxel) {
-  std::pair<float, VoxelHandle> flattest{std::numeric_limits<float>::infinity(), kEnd};
+  constexpr VoxelHandle kNone = 0xffffffffu;
+  std::pair<float, VoxelHandle> flattest{std::numeric_limits<float>::infinity(), kNone};
   grid_->ForEachNeighbour(stencil_, voxel, [&](VoxelHandle from, const Eigen::Vector3f&) {
     if (IsClustered(from) && policy_.CanPointBeSeed(from) && policy_.CanGrowToPoint(from, voxel))
       flattest = std::min(flattest, std::make_pair(policy_.Roughness(from), from));
     return true;
   });
-  if (flattest.second == kEnd) return;
+  if (flattest.second == kNone) return;
   BlockOf(voxel).pending &= ~CellBit(voxel);
-  AddVoxel(FindRoot(voxels_[flattest.second].label), voxel);
+  AddVoxel(FindRoot(LabelOf(flattest.second)), voxel);
 }
 
 /// The same where every neighbour counts: of a block whose voxels are all of one cluster, one within the radius decides, and
@@ -174,7 +164,7 @@ typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::Visit
     std::uint64_t pending = block.pending & at.cells;
     std::uint64_t clustered = block.clustered & at.cells;
     if (clustered != 0 && block.label != kMixed) {
-      SetBlockLabel(&block, FindRoot(block.label));
+      SetLabel(&block.label, FindRoot(block.label));
       if (block.label == root) clustered = 0;
     }
     if ((pending | clustered) == 0) return true;
@@ -189,8 +179,9 @@ typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::Visit
       if (is_near(first_of(pending))) Queue(first_of(pending));
     for (; clustered != 0; clustered &= clustered - 1) {
       const VoxelHandle to = first_of(clustered);
-      if (voxels_[to].label == root || !is_near(to)) continue;
-      root = Meet(root, voxels_[to].label);
+      const Label label = LabelOf(to);
+      if (label == root || !is_near(to)) continue;
+      root = Meet(root, label);
       if (block.label != kMixed) break;
     }
     return true;
@@ -220,13 +211,26 @@ void IncrementalSegmenter<Policy>::Release(Label label) const {
   }
 }
 
+/// Replaces a reference to a label, kNoLabel and kMixed being none.
 template <class Policy>
-void IncrementalSegmenter<Policy>::SetBlockLabel(BlockNode* block, Label label) {
-  const Label old = block->label;
+void IncrementalSegmenter<Policy>::SetLabel(Label* at, Label label) {
+  const Label old = *at;
   if (old == label) return;
   if (label < kMixed) ++nodes_[label].references;
-  block->label = label;
+  *at = label;
   if (old < kMixed) Release(old);
+}
+
+/// From now on each clustered voxel of this one's block has a label of its own.
+template <class Policy>
+void IncrementalSegmenter<Policy>::MixLabels(VoxelHandle voxel) {
+  BlockNode& block = BlockOf(voxel);
+  const VoxelHandle first = voxel - voxel % DynamicVoxelGrid::kCellsPerBlock;
+  for (std::uint64_t cells = block.clustered; cells != 0; cells &= cells - 1) {
+    labels_[first + static_cast<VoxelHandle>(__builtin_ctzll(cells))] = block.label;
+    ++nodes_[block.label].references;
+  }
+  SetLabel(&block.label, kMixed);
 }
 
 template <class Policy>
@@ -256,27 +260,20 @@ typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::NewCl
 
 template <class Policy>
 void IncrementalSegmenter<Policy>::AddVoxel(Label root, VoxelHandle voxel) {
-  Cluster& cluster = ClusterAt(root);
-  VoxelNode& node = voxels_[voxel];
-  node.label = root;
-  ++nodes_[root].references;
   BlockNode& block = BlockOf(voxel);
   if (block.clustered == 0) {
-    SetBlockLabel(&block, root);
+    SetLabel(&block.label, root);
   } else if (block.label != kMixed && FindRoot(block.label) != root) {
-    SetBlockLabel(&block, kMixed);
+    MixLabels(voxel);
+  }
+  if (block.label == kMixed) {
+    labels_[voxel] = root;
+    ++nodes_[root].references;
   }
   block.clustered |= CellBit(voxel);
-  if (cluster.first == kEnd) {
-    node.previous = node.next = voxel;
-  } else {
-    node.next = cluster.first;
-    node.previous = voxels_[cluster.first].previous;
-    voxels_[node.previous].next = voxel;
-    voxels_[node.next].previous = voxel;
-  }
-  cluster.first = voxel;
+  Cluster& cluster = ClusterAt(root);
   ++cluster.live_voxels;
+  if (cluster.state == State::kTooLarge) return;
   cluster.moments.Add(PointOf(voxel, grid_->CentroidInBlock(voxel)));
   cluster.grew = true;
   MarkDirty(&cluster);
@@ -296,15 +293,6 @@ typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::Link(
 
   kept.moments.Merge(absorbed.moments);
   kept.live_voxels += absorbed.live_voxels;
-  if (kept.first == kEnd) {
-    kept.first = absorbed.first;
-  } else if (absorbed.first != kEnd) {
-    const VoxelHandle kept_last = voxels_[kept.first].previous, absorbed_last = voxels_[absorbed.first].previous;
-    voxels_[kept_last].next = absorbed.first;
-    voxels_[absorbed.first].previous = kept_last;
-    voxels_[absorbed_last].next = kept.first;
-    voxels_[kept.first].previous = absorbed_last;
-  }
   if (absorbed.id != kNoSegment) kept.absorbed.push_back(absorbed.id);
   kept.absorbed.insert(kept.absorbed.end(), absorbed.absorbed.begin(), absorbed.absorbed.end());
   if (absorbed.state == State::kTooLarge || (absorbed.state == State::kCut && kept.state != State::kTooLarge))
@@ -436,19 +424,6 @@ const SegmentMoments& IncrementalSegmenter<Policy>::Moments(SegmentId segment) c
 }
 
 template <class Policy>
-std::vector<VoxelHandle> IncrementalSegmenter<Policy>::Voxels(SegmentId segment) const {
-  const Cluster& cluster = TrackedCluster(segment);
-  std::vector<VoxelHandle> voxels;
-  voxels.reserve(cluster.live_voxels);
-  VoxelHandle voxel = cluster.first;
-  do {
-    voxels.push_back(voxel);
-    voxel = voxels_[voxel].next;
-  } while (voxel != cluster.first);
-  return voxels;
-}
-
-template <class Policy>
 SegmentId IncrementalSegmenter<Policy>::SegmentOf(VoxelHandle voxel) const {
   return IsClustered(voxel) ? clusters_[ClusterOf(voxel)].id : kNoSegment;
 }
@@ -456,7 +431,7 @@ SegmentId IncrementalSegmenter<Policy>::SegmentOf(VoxelHandle voxel) const {
 template <class Policy>
 std::uint32_t IncrementalSegmenter<Policy>::ClusterOf(VoxelHandle voxel) const {
   if (!IsClustered(voxel)) throw std::invalid_argument("voxel " + std::to_string(voxel) + " is in no cluster");
-  return nodes_[FindRoot(voxels_[voxel].label)].cluster;
+  return nodes_[FindRoot(LabelOf(voxel))].cluster;
 }
 
 template <class Policy>
@@ -470,8 +445,7 @@ std::vector<SegmentId> IncrementalSegmenter<Policy>::Segments() const {
 template <class Policy>
 std::size_t IncrementalSegmenter<Policy>::memory_bytes() const {
   return nodes_.capacity() * sizeof(Node) + free_nodes_.capacity() * sizeof(Label) + clusters_.capacity() * sizeof(Cluster) +
-         free_clusters_.capacity() * sizeof(ClusterIndex) + voxels_.capacity() * sizeof(VoxelNode) +
-         blocks_.capacity() * sizeof(BlockNode) +
+         free_clusters_.capacity() * sizeof(ClusterIndex) + labels_.memory_bytes() + blocks_.memory_bytes() +
          (seeds_.capacity() + queue_.capacity() + region_.capacity() + rough_.capacity()) * sizeof(VoxelHandle);
 }
 

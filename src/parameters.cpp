@@ -322,6 +322,8 @@ const std::vector<Parameter>& Table() {
              "a segment gets a new view once it has grown by this factor since its last"),
       NUMBER(front_end.view.baseline_m, Above(0),
              "or once it changed and the sensor is this far from where its last view was taken"),
+      NUMBER(front_end.view.shown_points, AtLeast(0),
+             "points of a view that are kept, for people to look at (recognitions are refined on scans); 0: none"),
 
       NUMBER(front_end.thinning.cell_size_m, Above(0),
              "of each scan one point of every cubic cell of this side goes along, for refinement"),

@@ -45,6 +45,7 @@ class BatchFrontEnd {
   std::string robot_;
   GroundFilter ground_filter_;
   BatchBaseline baseline_;
+  std::size_t shown_points_;
   std::vector<SegmentState> last_;  // segments of the last step
   std::uint64_t sequence_ = 0;
   SegmentId next_id_ = 1;

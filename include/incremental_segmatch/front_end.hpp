@@ -21,10 +21,11 @@
 
 namespace incremental_segmatch {
 
-/// When a tracked segment's state is worth a view.
+/// When a tracked segment's state is worth a view, and what is shown of it.
 struct ViewParameters {
   double growth_factor = 1.4;  ///< a new view once the segment has grown by this factor since its last view
   double baseline_m = 10.0;    ///< or once it changed and the sensor is this far from where its last view was taken
+  std::size_t shown_points = 100;  ///< points of a view that are kept, for people to look at; 0: none
 };
 
 /// Of the robot side.
@@ -116,7 +117,7 @@ class FrontEnd {
   SegmentDelta DescribeChanges(const SegmentUpdate& left, const SegmentUpdate& grown);
   SegmentState DescribeSegment(SegmentId segment) const;
   bool IsNewView(const SegmentState& state);
-  std::shared_ptr<const Points> SegmentPoints(SegmentId segment, const Eigen::Vector3d& centroid_odom) const;
+  void ShowViews(const std::vector<VoxelHandle>& voxels, SegmentDelta* delta) const;
   SegmentDelta EmptyDelta() const;
   std::uint32_t OldestInsertion();
 

@@ -9,6 +9,7 @@
 
 #include "incremental_segmatch/dynamic_voxel_grid.hpp"
 #include "incremental_segmatch/growing_policies.hpp"
+#include "incremental_segmatch/paged_array.hpp"
 #include "incremental_segmatch/segment_moments.hpp"
 #include "incremental_segmatch/types.hpp"
 
@@ -79,8 +80,6 @@ class Segmenter {
 
   /// Sums over a segment's voxels. O(1).
   virtual const SegmentMoments& Moments(SegmentId segment) const = 0;
-  /// Voxels of the segment that are in the local map now. O(segment).
-  virtual std::vector<VoxelHandle> Voxels(SegmentId segment) const = 0;
   /// The segment of a voxel, kNoSegment if its cluster is none. Amortised nearly O(1).
   virtual SegmentId SegmentOf(VoxelHandle voxel) const = 0;
   /// All tracked segments, ascending.
@@ -109,7 +108,6 @@ class IncrementalSegmenter final : public Segmenter {
   SegmentUpdate Remove(const std::vector<RemovedVoxel>& removed) override;
   SegmentUpdate Insert(const VoxelUpdate& update) override;
   const SegmentMoments& Moments(SegmentId segment) const override;
-  std::vector<VoxelHandle> Voxels(SegmentId segment) const override;
   SegmentId SegmentOf(VoxelHandle voxel) const override;
   std::vector<SegmentId> Segments() const override;
   const ClusterCounts& counts() const override { return counts_; }
@@ -121,17 +119,15 @@ class IncrementalSegmenter final : public Segmenter {
  private:
   using Label = std::uint32_t;
   using ClusterIndex = std::uint32_t;
-  static constexpr Label kNoLabel = 0xffffffffu;  // not clustered yet
-  static constexpr Label kQueued = 0xfffffffeu;   // in the region that grows now
-  static constexpr Label kMixed = 0xfffffffdu;    // of a block with voxels of several clusters
-  static constexpr VoxelHandle kEnd = 0xffffffffu;
+  static constexpr Label kNoLabel = 0xffffffffu;  // of a block without clustered voxels
+  static constexpr Label kMixed = 0xfffffffeu;    // of a block with voxels of several labels
 
   enum class State : std::uint8_t { kFree, kSmall, kSegment, kTooLarge, kCut };
 
   // A label: node of the union-find forest.
   struct Node {
     Label parent = kNoLabel;       // itself at roots
-    std::uint32_t references = 0;  // voxels and blocks that carry the label, and nodes that point to it
+    std::uint32_t references = 0;  // blocks, and voxels of mixed blocks, that carry it, and nodes that point to it
     ClusterIndex cluster = 0;      // at roots
   };
   struct Cluster {
@@ -141,24 +137,24 @@ class IncrementalSegmenter final : public Segmenter {
     SegmentId id = kNoSegment;
     Label root = kNoLabel;
     std::uint32_t live_voxels = 0;  // in the local map now
-    VoxelHandle first = kEnd;       // of its circular, doubly linked list of voxels
-    SegmentMoments moments;
+    SegmentMoments moments;         // kTooLarge: of the voxels until then, nobody will read them again
     std::vector<SegmentId> absorbed;  // IDs of segments that merged into it in this call
   };
-  // What is known of a block of the grid, so that its voxels need not be looked at one by one.
-  struct BlockNode {
+  // What is known of a block of the grid, so that its voxels need not be looked at one by one. Active cells that are
+  // neither pending nor clustered are of the region that grows now.
+  struct alignas(32) BlockNode {
     std::uint64_t pending = 0;    // cells that are active and neither clustered nor queued yet
     std::uint64_t clustered = 0;  // cells that are clustered
-    Label label = kNoLabel;       // of the one cluster that all its clustered voxels belong to; or kMixed
-  };
-  struct VoxelNode {
-    Label label = kNoLabel;
-    VoxelHandle previous = kEnd;
-    VoxelHandle next = kEnd;
+    Label label = kNoLabel;       // of all its clustered voxels; or kMixed: each has its own
   };
 
   bool IsClustered(VoxelHandle voxel) const {
-    return voxel < voxels_.size() && voxels_[voxel].label != kNoLabel && voxels_[voxel].label != kQueued;
+    return voxel < labels_.size() && (BlockOf(voxel).clustered & CellBit(voxel)) != 0;
+  }
+  // Of a clustered voxel.
+  Label LabelOf(VoxelHandle voxel) const {
+    const Label label = BlockOf(voxel).label;
+    return label != kMixed ? label : labels_[voxel];
   }
   Eigen::Vector3d PointOf(VoxelHandle voxel, const Eigen::Vector3f& in_block) const {
     return grid_->BlockCorner(voxel) + in_block.cast<double>();
@@ -167,6 +163,7 @@ class IncrementalSegmenter final : public Segmenter {
     return std::uint64_t{1} << (voxel % DynamicVoxelGrid::kCellsPerBlock);
   }
   BlockNode& BlockOf(VoxelHandle voxel) { return blocks_[voxel / DynamicVoxelGrid::kCellsPerBlock]; }
+  const BlockNode& BlockOf(VoxelHandle voxel) const { return blocks_[voxel / DynamicVoxelGrid::kCellsPerBlock]; }
   Label FindRoot(Label label) const;
   void Release(Label label) const;
   Cluster& ClusterAt(Label root) { return clusters_[nodes_[root].cluster]; }
@@ -175,7 +172,8 @@ class IncrementalSegmenter final : public Segmenter {
   void FollowCentroids(const std::vector<MovedVoxel>& moved);
   void Queue(VoxelHandle voxel);
   Label Meet(Label root, Label other);
-  void SetBlockLabel(BlockNode* block, Label label);
+  void SetLabel(Label* at, Label label);
+  void MixLabels(VoxelHandle voxel);
   Label VisitNeighbours(VoxelHandle from, Label root);
   void JoinFlattestCluster(VoxelHandle voxel);
   Label VisitNeighbourBlocks(VoxelHandle from, Label root);
@@ -198,8 +196,8 @@ class IncrementalSegmenter final : public Segmenter {
   mutable std::vector<Label> free_nodes_;
   std::vector<Cluster> clusters_;
   std::vector<ClusterIndex> free_clusters_;
-  std::vector<VoxelNode> voxels_;  // by handle
-  std::vector<BlockNode> blocks_;  // by handle / DynamicVoxelGrid::kCellsPerBlock
+  PagedArray<BlockNode> blocks_;  // by handle / DynamicVoxelGrid::kCellsPerBlock
+  PagedArray<Label> labels_;      // by handle, of clustered voxels of mixed blocks
   std::vector<ClusterIndex> dirty_;
   std::vector<std::pair<SegmentId, ClusterIndex>> tracked_;  // ascending IDs
   std::vector<VoxelHandle> seeds_, queue_, region_, rough_;  // work space

@@ -15,8 +15,8 @@
 namespace incremental_segmatch {
 
 /// Elements stay where they are for the array's life. Memory is asked for in 2 MB pages: elements that are visited in
-/// no order miss the caches of address translation otherwise. O(1) access; growing is O(new elements). For large,
-/// trivially destructible types.
+/// no order miss the caches of address translation otherwise. O(1) access; growing is O(new elements). For trivially
+/// destructible types of at most 2 MB.
 template <class T>
 class PagedArray {
   static_assert(std::is_trivially_destructible_v<T>, "elements are not destroyed one by one");
@@ -45,8 +45,13 @@ class PagedArray {
 
  private:
   static constexpr std::size_t kHugePage = std::size_t{1} << 21;
-  static constexpr std::size_t kPerPage = 1024;
-  static constexpr std::size_t kPageBytes = (kPerPage * sizeof(T) + kHugePage - 1) / kHugePage * kHugePage;
+  static constexpr std::size_t kPageBytes = kHugePage;
+  static constexpr std::size_t LargestPowerOfTwo(std::size_t most) {
+    std::size_t power = 1;
+    while (2 * power <= most) power *= 2;
+    return power;
+  }
+  static constexpr std::size_t kPerPage = LargestPowerOfTwo(kPageBytes / sizeof(T));
   struct Free {
     void operator()(T* memory) const { ::operator delete (memory, std::align_val_t{kHugePage}); }
   };

@@ -12,6 +12,11 @@
 
 namespace incremental_segmatch {
 
+/// Every how many of a segment's points one is shown, so that at most `shown_points` (> 0) are.
+inline std::size_t ShownStride(std::size_t points, std::size_t shown_points) {
+  return (points + shown_points - 1) / shown_points;
+}
+
 /// A segment as it is now.
 struct SegmentState {
   SegmentId id = kNoSegment;                                ///< unique per robot, never reused
@@ -19,8 +24,9 @@ struct SegmentState {
   Eigen::Vector3d centroid_odom = Eigen::Vector3d::Zero();  ///< mean of its voxels' centroids (m)
   Descriptor descriptor;                                    ///< unscaled
   bool new_view = false;  ///< worth keeping as a view: it grew, or is seen from elsewhere
-  std::shared_ptr<const Points>
-      points_centroid;  ///< with new_view: relative to centroid_odom, odom's axes; may be null
+  /// With new_view: some of the points that were seen of it, for people to look at (recognitions are refined on scans).
+  /// Relative to centroid_odom, odom's axes; may be null.
+  std::shared_ptr<const Points> points_centroid;
 };
 
 /// One step of one robot. Deltas of a robot have consecutive sequence numbers; a full state replaces all that was said

@@ -35,7 +35,8 @@ struct SegmentView {
   std::uint32_t size = 0;                                     ///< voxels
   Eigen::Vector3d centroid_sensor = Eigen::Vector3d::Zero();  ///< in the frame of that pose
   Descriptor descriptor;                                      ///< unscaled
-  std::shared_ptr<const Points> points_centroid;  ///< relative to the centroid, axes of that robot's odom; may be null
+  /// Some of the points that were seen, to look at: relative to the centroid, axes of that robot's odom; may be null.
+  std::shared_ptr<const Points> points_centroid;
 };
 
 /// A segment of the map, with the views that are kept of it.

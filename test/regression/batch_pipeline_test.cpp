@@ -41,7 +41,12 @@ TEST(BatchPipeline, FirstScanGivesTheSegmentsOfTheIncrementalPipeline) {
     });
     EXPECT_LT((twin->centroid_odom - segment.centroid_odom).norm(), 0.01);
     EXPECT_NEAR(twin->size, segment.size, 2 + 0.01 * segment.size) << "voxels of float and double grids";
-    EXPECT_EQ(twin->points_centroid->size(), twin->size);
+    for (const SegmentState* shown : {&segment, &*twin}) {
+      const std::size_t limit = defaults.front_end.view.shown_points;
+      EXPECT_LE(shown->points_centroid->size(), limit);
+      EXPECT_GE(10 * shown->points_centroid->size(), std::min<std::size_t>(limit, shown->size));
+      for (const Eigen::Vector3f& p : *shown->points_centroid) EXPECT_LT(p.norm(), 50.f);
+    }
   }
 }
 
