@@ -161,6 +161,7 @@ void BackEnd::ChangeParameters(const BackEndParameters& parameters) {
   BackEnd(parameters, TargetMap(parameters.target_map));  // refuses what is out of range
   parameters_ = parameters;
   recognizers_.clear();
+  submaps_.clear();
   for (Robot& robot : robots_)
     for (auto& [id, segment] : robot.local) segment.queried.resize(0);
 }
@@ -426,7 +427,7 @@ const SegmentView& BackEnd::MatchedView(RobotIndex robot, const Correspondence& 
 /// Refines a recognition on scans, gathers the evidence for it and judges that. `counts` gets the evidence and the end,
 /// which says whether what comes back is accepted.
 std::optional<Closure> BackEnd::Verify(RobotIndex robot, StampNs stamp_ns, const RecognizerResult& result,
-                                       BackEndCounts* counts) const {
+                                       BackEndCounts* counts) {
   const Recognition& recognition = *result.recognition;
   const std::optional<KeyframeName> target = NearestKeyframe(robot, stamp_ns, recognition);
   if (!target) {
@@ -439,16 +440,11 @@ std::optional<Closure> BackEnd::Verify(RobotIndex robot, StampNs stamp_ns, const
   evidence.runner_up = recognition.runner_up_size;
   evidence.since_twin_m = robots_[robot].path_m - robots_[robot].twin_path_m;
   if (parameters_.refinement.enabled && closure.T_target_query.translation().norm() <= parameters_.acceptance.max_distance_m) {
-    const std::optional<RefinedTransform> refined = Refine(robot, *target, closure.T_target_query);
-    if (!refined) {
+    if (!Refine(robot, *target, &closure)) {
       counts->end = StepEnd::kNotRefined;
       return std::nullopt;
     }
-    closure.T_map_odom = closure.T_map_odom * robots_[robot].T_odom_sensor * closure.T_target_query.inverse() *
-                         refined->T_target_local * robots_[robot].T_odom_sensor.inverse();
-    closure.T_target_query = refined->T_target_local;
-    closure.covariance = MoveToTheRight(refined->covariance, closure.T_target_query);
-    evidence.overlap = refined->overlap;
+    evidence.overlap = closure.evidence.overlap;
   }
   MeasureCoverage(robot, closure.T_map_odom, &evidence);
   MeasureContradiction(robot, *target, closure, &evidence);
@@ -584,19 +580,48 @@ bool BackEnd::IsYoung(RobotIndex robot, StampNs now_ns, std::uint32_t pose) cons
          robots_[robot].path_m - map_.Trajectory(robot)[pose].path_m <= parameters_.matching.min_path_m;
 }
 
-/// The scan that made the recognition against those around the key frame: neither has drifted, as the local map and the
-/// segments that were gathered along the way have.
-std::optional<RefinedTransform> BackEnd::Refine(RobotIndex robot, const KeyframeName& target,
-                                                const Pose& T_target_query) const {
-  if (!robots_[robot].scan_sensor) return std::nullopt;
+/// The scan that made the recognition is laid on those around the key frame: neither has drifted, as the local map and the
+/// segments that were gathered along the way have. False if it doesn't fit.
+bool BackEnd::Refine(RobotIndex index, const KeyframeName& target, Closure* closure) {
+  const Robot& robot = robots_[index];
+  if (!robot.scan_sensor) return false;
   std::vector<Eigen::Vector3d> points_query;
-  points_query.reserve(robots_[robot].scan_sensor->size());
-  for (const Eigen::Vector3f& p : *robots_[robot].scan_sensor) points_query.push_back(p.cast<double>());
-  return RefineOnPoints(points_query, Submap(target), T_target_query, parameters_.refinement);
+  points_query.reserve(robot.scan_sensor->size());
+  for (const Eigen::Vector3f& p : *robot.scan_sensor) points_query.push_back(p.cast<double>());
+
+  Submap& submap = SubmapAround(target);
+  const Pose T_center_target = PoseOf(submap.center).T_odom_sensor.inverse() * PoseOf(target).T_odom_sensor;
+  const std::optional<RefinedTransform> refined =
+      submap.target.Refine(points_query, T_center_target * closure->T_target_query);
+  if (!refined) return false;
+  const Pose T_target_query = T_center_target.inverse() * refined->T_target_local;
+  closure->T_map_odom = closure->T_map_odom * robot.T_odom_sensor * closure->T_target_query.inverse() * T_target_query *
+                        robot.T_odom_sensor.inverse();
+  closure->T_target_query = T_target_query;
+  closure->covariance = MoveToTheRight(refined->covariance, refined->T_target_local);
+  closure->evidence.overlap = refined->overlap;
+  return true;
+}
+
+/// Of the last submaps one whose center is near, or a new one around the key frame.
+BackEnd::Submap& BackEnd::SubmapAround(const KeyframeName& keyframe) {
+  constexpr std::size_t kKept = 2;  // passes of one street take turns
+  const auto is_near = [&](const Submap& submap) {
+    return submap.center.robot == keyframe.robot &&
+           std::abs(PoseOf(submap.center).path_m - PoseOf(keyframe).path_m) <= 0.5 * parameters_.keyframes.submap_radius_m;
+  };
+  const auto found = std::find_if(submaps_.begin(), submaps_.end(), is_near);
+  if (found != submaps_.end()) {
+    std::rotate(submaps_.begin(), found, found + 1);
+  } else {
+    submaps_.push_front({keyframe, RefinementTarget(JoinScans(keyframe), parameters_.refinement)});
+    if (submaps_.size() > kKept) submaps_.pop_back();
+  }
+  return submaps_.front();
 }
 
 /// Scans of a key frame and of its neighbours along the trajectory, in its sensor's frame. Odometry joins them.
-std::vector<Eigen::Vector3d> BackEnd::Submap(const KeyframeName& center) const {
+std::vector<Eigen::Vector3d> BackEnd::JoinScans(const KeyframeName& center) const {
   const std::vector<Keyframe>& keyframes = map_.Keyframes(center.robot);
   const Pose T_center_odom = PoseOf(center).T_odom_sensor.inverse();
   std::vector<Eigen::Vector3d> points;

@@ -413,6 +413,8 @@ const std::vector<Parameter>& Table() {
       NUMBER(back_end.refinement.max_points, AtLeast(30), "local points that are used"),
       NUMBER(back_end.refinement.min_stiffness, Inside(0, 1),
              "information of a direction over that of the best one, below which the points leave it open"),
+      NUMBER(back_end.refinement.floor_m, AtLeast(0), "standard deviation of what the points don't tell, along each axis"),
+      NUMBER(back_end.refinement.floor_rad, AtLeast(0), "and about each axis"),
       NUMBER(back_end.refinement.max_open_directions, Between(0, 5),
              "of six; more refuses the recognition; walls and poles alone leave the height open"),
 

@@ -23,7 +23,11 @@ constexpr std::size_t kMinNeighbours = 8;  // that tell a surface's direction
 constexpr double kPointWeight = 0.02;      // of a distance to a point: it has the cloud's spacing for an error
 constexpr std::size_t kMinPairs = 30;
 constexpr std::size_t kMaxCoarsePoints = 1000;
-constexpr double kShrink = 0.85;          // of the robust weight's width, from iteration to iteration
+constexpr double kShrink = 0.85;          // of the robust weight's width, from iteration to iteration,
+constexpr double kSettledShrink = 0.6;    // once the points move less than
+constexpr double kSettled = 0.1;          // this share of it
+constexpr double kFineSpacing = 1.0 / 3.0;  // of the target's points, over the distance to a partner at the end
+constexpr double kStale = 0.2;  // motion over the spacing of the target's points, after which partners are sought anew
 constexpr double kFineWidth = 1.0 / 3.0;  // of the robust weight in the last iteration, over the distance to a partner
 constexpr double kConvergedM = 5e-4;      // motion of the points in the last iteration
 constexpr double kMaxExtentM = 1e5;       // floats are exact enough to a centimetre up to here
@@ -38,14 +42,20 @@ Matrix6 Shift(const Eigen::Vector3d& center) {
 class CellHash {
  public:
   CellHash(const std::vector<Eigen::Vector3f>& points, float side) : side_(side), per_metre_(1.f / side) {
-    std::size_t slots = 16;
-    while (slots < 2 * points.size()) slots *= 2;
-    table_.resize(slots);
     std::vector<std::uint32_t> slot_of(points.size());
-    for (std::size_t i = 0; i < points.size(); ++i) {
-      slot_of[i] = FindOrAdd(KeyOf(points[i]));
-      ++table_[slot_of[i]].count;
-    }
+    const auto count_points = [&](std::size_t least_slots) {
+      std::size_t slots = 16;
+      while (slots < least_slots) slots *= 2;
+      table_.assign(slots, {});
+      used_.clear();
+      for (std::size_t i = 0; i < points.size(); ++i) {
+        slot_of[i] = FindOrAdd(KeyOf(points[i]));
+        ++table_[slot_of[i]].count;
+      }
+    };
+    count_points(2 * points.size());
+    // Searches are as fast as the table is small.
+    if (8 * used_.size() < table_.size()) count_points(2 * used_.size());
     std::uint32_t begin = 0;
     for (const std::uint32_t slot : used_) {
       table_[slot].begin = begin;
@@ -173,11 +183,11 @@ class CellHash {
   std::vector<std::uint32_t> used_;
 };
 
-/// In which directions a target point holds a local point, as the metric of its residual.
+/// In which directions a target point holds a local point.
 struct Surface {
-  bool known = false;
-  bool is_thin = false;
-  Eigen::Matrix3f metric = Eigen::Matrix3f::Zero();
+  static constexpr int kUnknown = -1;
+  int thin_directions = kUnknown;  ///< across a surface 1, across a pole 2, otherwise 0: held to the point itself
+  std::array<Eigen::Vector3f, 2> across;
 };
 
 Surface EstimateSurface(const CellHash& cloud, const Eigen::Vector3f& p, float radius) {
@@ -191,34 +201,30 @@ Surface EstimateSurface(const CellHash& cloud, const Eigen::Vector3f& p, float r
     outer.noalias() += d * d.transpose();
   });
   Surface surface;
-  surface.known = true;
-  surface.metric = static_cast<float>(kPointWeight) * Eigen::Matrix3f::Identity();
+  surface.thin_directions = 0;
   if (count < kMinNeighbours) return surface;
   const float n = static_cast<float>(count);
   Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d> solver;
   solver.computeDirect((outer / n - sum * sum.transpose() / (n * n)).cast<double>());
   const Eigen::Vector3f variance = solver.eigenvalues().cast<float>();
   if (!(variance[0] < kThin * variance[2])) return surface;
-  surface.is_thin = true;
-  surface.metric.setZero();
   // A pole is thin in two directions alike; the rim of a wall, where the neighbourhood is cut off, only seems to be.
   const bool is_pole = variance[1] < kThin * variance[2] && variance[0] > kThin * variance[1];
-  for (int axis = 0; axis < (is_pole ? 2 : 1); ++axis) {
-    const Eigen::Vector3f across = solver.eigenvectors().col(axis).cast<float>();
-    surface.metric += across * across.transpose();
-  }
+  surface.thin_directions = is_pole ? 2 : 1;
+  for (int axis = 0; axis < surface.thin_directions; ++axis)
+    surface.across[axis] = solver.eigenvectors().col(axis).cast<float>();
   return surface;
 }
 
 /// The target at one spacing, with surfaces that are estimated when they are first asked for.
-class Target {
+class SurfaceCloud {
  public:
-  Target(const std::vector<Eigen::Vector3f>& points, float side) : cells_(points, side), surfaces_(points.size()) {}
+  SurfaceCloud(const std::vector<Eigen::Vector3f>& points, float side) : cells_(points, side), surfaces_(points.size()) {}
 
   const CellHash& cells() const { return cells_; }
   const Surface& SurfaceAt(std::uint32_t point, const CellHash& cloud, float radius) {
     Surface& surface = surfaces_[point];
-    if (!surface.known) surface = EstimateSurface(cloud, cells_.points()[point], radius);
+    if (surface.thin_directions == Surface::kUnknown) surface = EstimateSurface(cloud, cells_.points()[point], radius);
     return surface;
   }
 
@@ -246,41 +252,65 @@ struct System {
   }
 };
 
-System BuildSystem(const std::vector<Eigen::Vector3f>& local, const Pose& T_target_local, Target* target,
-                   const CellHash& cloud, float radius, float distance, double width_m) {
+/// Adds weight * J^T J of a residual along a direction at a point, and its gradient.
+void AddResidual(const Eigen::Vector3d& direction, const Eigen::Vector3d& at, double residual, double weight,
+                 System* system) {
+  Vector6 J;
+  J << direction, at.cross(direction);
+  const Vector6 weighted = weight * J;
+  system->information.noalias() += weighted * J.transpose();
+  system->gradient += residual * weighted;
+}
+
+/// Of each local point the nearest target point within the distance, or kNone.
+std::vector<std::uint32_t> FindPartners(const std::vector<Eigen::Vector3f>& local, const Pose& T_target_local,
+                                        const CellHash& target, float distance) {
+  const Eigen::Matrix3f R = T_target_local.linear().cast<float>();
+  const Eigen::Vector3f t = T_target_local.translation().cast<float>();
+  std::vector<std::uint32_t> partners;
+  partners.reserve(local.size());
+  for (const Eigen::Vector3f& point : local) partners.push_back(target.Nearest(R * point + t, distance));
+  return partners;
+}
+
+System BuildSystem(const std::vector<Eigen::Vector3f>& local, const std::vector<std::uint32_t>& partners,
+                   const Pose& T_target_local, SurfaceCloud* target, const CellHash& cloud, float radius, float distance,
+                   double width_m) {
   const Eigen::Matrix3f R = T_target_local.linear().cast<float>();
   const Eigen::Vector3f t = T_target_local.translation().cast<float>();
   const double width2 = width_m * width_m;
   System system;
-  for (const Eigen::Vector3f& point : local) {
-    const Eigen::Vector3f p = R * point + t;
-    const std::uint32_t nearest = target->cells().Nearest(p, distance);
-    if (nearest == kNone) continue;
-    const Surface& surface = target->SurfaceAt(nearest, cloud, radius);
-    const Eigen::Vector3d difference = (p - target->cells().points()[nearest]).cast<double>();
-    const Eigen::Matrix3d metric = surface.metric.cast<double>();
-    const Eigen::Vector3d force = metric * difference;
-    const double square = difference.dot(force);
-    const double weight = std::pow(width2 / (width2 + square), 2);  // Geman and McClure
+  for (std::size_t i = 0; i < local.size(); ++i) {
+    if (partners[i] == kNone) continue;
+    const Eigen::Vector3f p = R * local[i] + t;
+    const Eigen::Vector3d difference = (p - target->cells().points()[partners[i]]).cast<double>();
+    if (difference.squaredNorm() > distance * distance) continue;
+    const Surface& surface = target->SurfaceAt(partners[i], cloud, radius);
     const Eigen::Vector3d at = p.cast<double>();
-    const Eigen::Matrix3d cross = CrossMatrix(at);
-    const Eigen::Matrix3d metric_cross = metric * cross;
-    system.information.topLeftCorner<3, 3>() += weight * metric;
-    system.information.topRightCorner<3, 3>() -= weight * metric_cross;
-    system.information.bottomRightCorner<3, 3>() -= weight * (cross * metric_cross);
-    system.gradient.head<3>() += weight * force;
-    system.gradient.tail<3>() += weight * at.cross(force);
-    system.squares += weight * square;
-    system.weights += weight;
-    if (surface.is_thin) {
+    std::array<double, 2> residual{};
+    double square = 0.0;
+    for (int k = 0; k < surface.thin_directions; ++k) {
+      residual[k] = difference.dot(surface.across[k].cast<double>());
+      square += residual[k] * residual[k];
+    }
+    if (surface.thin_directions == 0) square = kPointWeight * difference.squaredNorm();
+    const double root = width2 / (width2 + square);
+    const double weight = root * root;  // Geman and McClure
+    if (surface.thin_directions == 0) {
+      for (int axis = 0; axis < 3; ++axis)
+        AddResidual(Eigen::Vector3d::Unit(axis), at, difference[axis], kPointWeight * weight, &system);
+    } else {
+      for (int k = 0; k < surface.thin_directions; ++k)
+        AddResidual(surface.across[k].cast<double>(), at, residual[k], weight, &system);
       system.thin_squares += square;
       ++system.thin_pairs;
     }
+    system.squares += weight * square;
+    system.weights += weight;
     system.sum += at;
     system.sum_squared_norms += at.squaredNorm();
     ++system.pairs;
   }
-  system.information.bottomLeftCorner<3, 3>() = system.information.topRightCorner<3, 3>().transpose();
   return system;
 }
 
@@ -376,43 +406,83 @@ void Validate(const RefinementParameters& parameters) {
     Refuse("min_stiffness", parameters.min_stiffness, "between 0 and 1");
   if (parameters.max_open_directions < 0 || parameters.max_open_directions > 5)
     Refuse("max_open_directions", parameters.max_open_directions, "between 0 and 5");
+  if (!(parameters.floor_m >= 0.0) || !std::isfinite(parameters.floor_m))
+    Refuse("floor_m", parameters.floor_m, "zero or positive, and finite");
+  if (!(parameters.floor_rad >= 0.0) || !std::isfinite(parameters.floor_rad))
+    Refuse("floor_rad", parameters.floor_rad, "zero or positive, and finite");
 }
 
-std::optional<RefinedTransform> RefineOnPoints(const std::vector<Eigen::Vector3d>& points_local,
-                                               const std::vector<Eigen::Vector3d>& points_target,
-                                               const Pose& T_target_local, const RefinementParameters& parameters) {
-  Validate(parameters);
-  // Both clouds are taken relative to their own centers: floats and normal equations are good at small numbers.
-  const Eigen::Vector3d center_target = Mean(points_target);
-  const Eigen::Vector3d center_local = Mean(points_local);
-  const std::vector<Eigen::Vector3f> local = Thin(Center(points_local, center_local), parameters.max_points);
-  const std::vector<Eigen::Vector3f> cloud = Center(points_target, center_target);
-  if (local.size() < kMinPairs || cloud.size() < kMinPairs) return std::nullopt;
-  const std::vector<Eigen::Vector3f> coarse_local = Thin(local, kMaxCoarsePoints);
-  const float radius = static_cast<float>(parameters.normal_radius_m);
-  const float min_distance = static_cast<float>(parameters.min_distance_m);
+/// Relative to its own center, as the local cloud is to its own: floats and normal equations are good at small numbers.
+struct RefinementTarget::Impl {
+  Impl(const std::vector<Eigen::Vector3d>& points, const RefinementParameters& parameters)
+      : parameters(parameters),
+        center(Mean(points)),
+        fine(CellHash(Center(points, center), static_cast<float>(kFineSpacing * parameters.min_distance_m)).CellMeans(),
+             static_cast<float>(std::max(parameters.normal_radius_m, parameters.min_distance_m))),
+        coarse(CellHash(fine.cells().points(), static_cast<float>(parameters.min_distance_m)).CellMeans(),
+               static_cast<float>(parameters.max_distance_m)) {}
 
-  Target fine(cloud, std::max(radius, min_distance));
-  Target coarse(CellHash(cloud, min_distance).CellMeans(), static_cast<float>(parameters.max_distance_m));
+  /// Partners are those of the last call as long as they are of the same points and these have hardly moved since.
+  System BuildSystem(const std::vector<Eigen::Vector3f>& local, const Pose& T, double width_m, double moved_m) {
+    SurfaceCloud* const target = width_m <= parameters.min_distance_m ? &fine : &coarse;
+    const float distance = static_cast<float>(std::max(width_m, parameters.min_distance_m));
+    moved_since_m += moved_m;
+    const double spacing_m = (target == &fine ? kFineSpacing : 1.0) * parameters.min_distance_m;
+    if (target != searched || partners.size() != local.size() || moved_since_m > kStale * spacing_m) {
+      partners = FindPartners(local, T, target->cells(), distance);
+      searched = target;
+      moved_since_m = 0.0;
+    }
+    return incremental_segmatch::BuildSystem(local, partners, T, target, fine.cells(),
+                                             static_cast<float>(parameters.normal_radius_m), distance, width_m);
+  }
+
+  RefinementParameters parameters;
+  Eigen::Vector3d center;
+  SurfaceCloud fine;
+  SurfaceCloud coarse;
+  std::vector<std::uint32_t> partners;       ///< of the running refinement's points
+  const SurfaceCloud* searched = nullptr;    ///< where they are
+  double moved_since_m = 0.0;
+};
+
+RefinementTarget::RefinementTarget(const std::vector<Eigen::Vector3d>& points_target,
+                                   const RefinementParameters& parameters) {
+  Validate(parameters);
+  impl_ = std::make_unique<Impl>(points_target, parameters);
+}
+RefinementTarget::~RefinementTarget() = default;
+RefinementTarget::RefinementTarget(RefinementTarget&&) noexcept = default;
+RefinementTarget& RefinementTarget::operator=(RefinementTarget&&) noexcept = default;
+
+std::optional<RefinedTransform> RefinementTarget::Refine(const std::vector<Eigen::Vector3d>& points_local,
+                                                         const Pose& T_target_local) {
+  const RefinementParameters& parameters = impl_->parameters;
+  const Eigen::Vector3d center_target = impl_->center, center_local = Mean(points_local);
+  const std::vector<Eigen::Vector3f> local = Thin(Center(points_local, center_local), parameters.max_points);
+  if (local.size() < kMinPairs || impl_->fine.cells().points().size() < kMinPairs) return std::nullopt;
+  const std::vector<Eigen::Vector3f> coarse_local = Thin(local, kMaxCoarsePoints);
   Pose T = Eigen::Translation3d(-center_target) * T_target_local * Eigen::Translation3d(center_local);
 
   // Wide as long as far points are far from their true partners; the distance to a partner follows down to its minimum.
   const double last_width_m = kFineWidth * parameters.min_distance_m;
   double width_m = parameters.max_distance_m;
-  for (int iteration = 0; iteration < parameters.max_iterations; ++iteration) {
+  System system;
+  double moved_m = 0.0;
+  bool converged = false;
+  impl_->searched = nullptr;
+  for (int iteration = 0; iteration < parameters.max_iterations && !converged; ++iteration) {
     const bool is_last = width_m == last_width_m;
-    const bool is_fine = width_m <= parameters.min_distance_m;
-    const double distance_m = std::max(width_m, parameters.min_distance_m);
-    const System system = BuildSystem(is_last ? local : coarse_local, T, is_fine ? &fine : &coarse, fine.cells(),
-                                      radius, static_cast<float>(distance_m), width_m);
+    system = impl_->BuildSystem(is_last ? local : coarse_local, T, width_m, moved_m);
     if (system.pairs < kMinPairs) return std::nullopt;
     const auto [step, length_m] = Directions(system, parameters.min_stiffness).Step(system.gradient);
     T = Perturb(step, T);
-    if (is_last && length_m < kConvergedM) break;
-    width_m = std::max(last_width_m, kShrink * width_m);
+    moved_m = length_m;
+    converged = is_last && length_m < kConvergedM;
+    width_m = std::max(last_width_m, (length_m < kSettled * width_m ? kSettledShrink : kShrink) * width_m);
   }
+  if (!converged) system = impl_->BuildSystem(local, T, last_width_m, moved_m);
 
-  const System system = BuildSystem(local, T, &fine, fine.cells(), radius, min_distance, last_width_m);
   RefinedTransform refined;
   refined.overlap = static_cast<double>(system.pairs) / static_cast<double>(local.size());
   if (system.pairs < kMinPairs || refined.overlap < parameters.min_overlap) return std::nullopt;
@@ -421,13 +491,17 @@ std::optional<RefinedTransform> RefineOnPoints(const std::vector<Eigen::Vector3d
   if (directions.open > parameters.max_open_directions) return std::nullopt;
   refined.rms_m = std::sqrt(system.thin_squares / static_cast<double>(std::max<std::size_t>(1, system.thin_pairs)));
 
-  const double variance = system.squares / system.weights / IndependentShare(local, min_distance);
-  Vector6 variances;
+  const double variance =
+      system.squares / system.weights / IndependentShare(local, static_cast<float>(parameters.min_distance_m));
+  Vector6 variances, floors;
   for (int i = 0; i < 6; ++i)
     variances[i] =
         i < directions.open ? std::pow(parameters.max_distance_m / 2.0, 2) : variance / directions.stiffness[i];
-  const Matrix6 to_target_origin = Shift(center_target) * directions.basis;
-  refined.covariance = to_target_origin * variances.asDiagonal() * to_target_origin.transpose();
+  floors << Eigen::Vector3d::Constant(std::pow(parameters.floor_m, 2)),
+      Eigen::Vector3d::Constant(std::pow(parameters.floor_rad, 2));
+  const Matrix6 to_target_origin = Shift(center_target), from_directions = to_target_origin * directions.basis;
+  refined.covariance = from_directions * variances.asDiagonal() * from_directions.transpose() +
+                       to_target_origin * floors.asDiagonal() * to_target_origin.transpose();
   refined.T_target_local = Eigen::Translation3d(center_target) * T * Eigen::Translation3d(-center_local);
   // Products of many rotations drift from being one.
   refined.T_target_local.linear() = Eigen::Quaterniond(refined.T_target_local.linear()).normalized().toRotationMatrix();

@@ -217,6 +217,12 @@ class BackEnd {
     std::size_t index = 0;
   };
 
+  // The joined scans of a key frame and of those around it.
+  struct Submap {
+    KeyframeName center;
+    RefinementTarget target;  // in the sensor's frame of the center
+  };
+
   RobotIndex RobotByName(const std::string& name);
   bool IsLoopClosure() const { return parameters_.mode == Mode::kLoopClosure; }
   BackEndStep AttemptRecognition(RobotIndex robot, StageTimer timer);
@@ -229,8 +235,7 @@ class BackEnd {
   bool NeedsQuery(RobotIndex robot, const LocalSegment& segment) const;
   std::map<RobotIndex, Correspondences> CollectCorrespondences(RobotIndex robot) const;
   RecognizerResult Recognize(RobotIndex robot, const std::map<RobotIndex, Correspondences>& by_frame);
-  std::optional<Closure> Verify(RobotIndex robot, StampNs stamp_ns, const RecognizerResult& result,
-                                BackEndCounts* counts) const;
+  std::optional<Closure> Verify(RobotIndex robot, StampNs stamp_ns, const RecognizerResult& result, BackEndCounts* counts);
   const SegmentView& MatchedView(RobotIndex robot, const Correspondence& inlier) const;
   const TrajectoryPose& PoseOf(const KeyframeName& keyframe) const;
   std::optional<KeyframeName> NearestKeyframeAlong(const KeyframeName& around, double along_m, const Eigen::Vector3d& place) const;
@@ -238,8 +243,9 @@ class BackEnd {
   void KeepHistory(RobotIndex robot);
   bool IsYoung(RobotIndex robot, StampNs now_ns, std::uint32_t pose) const;
   std::optional<KeyframeName> NearestKeyframe(RobotIndex robot, StampNs stamp_ns, const Recognition& recognition) const;
-  std::optional<RefinedTransform> Refine(RobotIndex robot, const KeyframeName& target, const Pose& T_target_query) const;
-  std::vector<Eigen::Vector3d> Submap(const KeyframeName& center) const;
+  bool Refine(RobotIndex robot, const KeyframeName& target, Closure* closure);
+  Submap& SubmapAround(const KeyframeName& keyframe);
+  std::vector<Eigen::Vector3d> JoinScans(const KeyframeName& center) const;
   void MeasureCoverage(RobotIndex robot, const Pose& T_map_odom, Evidence* evidence) const;
   Closure MakeClosure(RobotIndex robot, StampNs stamp_ns, const Recognition& recognition, const KeyframeName& keyframe) const;
   void KeepKeyframe(RobotIndex robot, const std::optional<Closure>& closure);
@@ -254,6 +260,7 @@ class BackEnd {
   std::vector<Robot> robots_;  // by RobotIndex; those of a loaded map come first
   RobotIndex loaded_robots_ = 0;
   std::multimap<StampNs, Waiting> waiting_;  // by when they were last seen
+  std::deque<Submap> submaps_;               // of the last refinements, newest first: the next one is near
 };
 
 }  // namespace incremental_segmatch

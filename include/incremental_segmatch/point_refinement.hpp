@@ -1,8 +1,9 @@
 /// \file
-/// Refines a recognition on the points of its matched segments (METHOD 5, beyond).
+/// Refines a recognition on the points of both visits (METHOD 5, beyond).
 #pragma once
 
 #include <cstddef>
+#include <memory>
 #include <optional>
 #include <vector>
 
@@ -23,6 +24,8 @@ struct RefinementParameters {
   double min_stiffness =
       0.005;  ///< information of a direction over that of the best one, below which the points leave it open
   int max_open_directions = 1;  ///< of six; more refuses the recognition; walls and poles alone leave the height open
+  double floor_m = 0.01;        ///< standard deviation per axis of what the points don't tell: the target's own drift
+  double floor_rad = 0.0005;    ///< and of the rotation about each axis
 };
 
 /// A refined transform with its evidence.
@@ -33,19 +36,31 @@ struct RefinedTransform {
   int open_directions = 0;  ///< directions of six in which the points say nothing and the given pose stays
   /// From the information of the point pairs (points of one cell of min_distance_m count as one), ROS's order,
   /// perturbation on the left: T_true = exp(xi) T in the axes and about the origin of the target's frame. Open
-  /// directions have a standard deviation of max_distance_m / 2 at the points.
+  /// directions have a standard deviation of max_distance_m / 2 at the points. The floors are part of it.
   Covariance6 covariance = Covariance6::Identity();
 };
 
+/// A cloud that others are laid on, prepared once for many of them.
+///
 /// Iterative closest points over two clouds in their own frames (metres, relative to any origin): robustly weighted
 /// Gauss-Newton on distances across what is thin about a target point (a surface, a pole), or to the point itself where
-/// nothing is. Nothing if the clouds overlap too little or leave more directions of the pose open than allowed.
-/// Deterministic; points that are not finite are ignored. O(points + max_points * iterations).
-///
-/// Throws std::invalid_argument naming the parameter that is out of range.
-std::optional<RefinedTransform> RefineOnPoints(const std::vector<Eigen::Vector3d>& points_local,
-                                               const std::vector<Eigen::Vector3d>& points_target,
-                                               const Pose& T_target_local, const RefinementParameters& parameters);
+/// nothing is. Deterministic; points that are not finite are ignored. Not thread-safe.
+class RefinementTarget {
+ public:
+  /// Throws std::invalid_argument naming the parameter that is out of range. O(points).
+  RefinementTarget(const std::vector<Eigen::Vector3d>& points_target, const RefinementParameters& parameters);
+  ~RefinementTarget();
+  RefinementTarget(RefinementTarget&&) noexcept;             ///< what was moved from can only be assigned to or destroyed
+  RefinementTarget& operator=(RefinementTarget&&) noexcept;  ///< likewise
+
+  /// Nothing if the clouds overlap too little or leave more directions of the pose open than allowed.
+  /// O(points + max_points * iterations).
+  std::optional<RefinedTransform> Refine(const std::vector<Eigen::Vector3d>& points_local, const Pose& T_target_local);
+
+ private:
+  struct Impl;
+  std::unique_ptr<Impl> impl_;
+};
 
 /// Throws std::invalid_argument naming the parameter that is out of range.
 void Validate(const RefinementParameters& parameters);

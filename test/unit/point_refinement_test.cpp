@@ -97,6 +97,11 @@ struct Problem {
 };
 
 // Of 30 objects 18 are seen by both sides, 6 by either side alone.
+std::optional<RefinedTransform> RefineOnPoints(const Cloud& local, const Cloud& target, const Pose& T_target_local,
+                                               const RefinementParameters& parameters) {
+  return RefinementTarget(target, parameters).Refine(local, T_target_local);
+}
+
 Problem MakeProblem(std::mt19937& random, double radius_m = 20.0) {
   std::uniform_real_distribution<double> far(-500.0, 500.0), yaw(-M_PI, M_PI);
   const std::vector<Object> scene = RandomScene(random, 30, radius_m);
@@ -173,7 +178,7 @@ TEST(PointRefinement, TheCovarianceTellsTheError) {
   }
   EXPECT_GE(within_four, 29);
   EXPECT_GE(within_two, 22);
-  EXPECT_GT(sum / 30.0, 0.4) << "too cautious";
+  EXPECT_GT(sum / 30.0, 0.25) << "too cautious: the floors are for more than this scene's noise";
 }
 
 TEST(PointRefinement, DoesNotDependOnWhereTheFramesHaveTheirOrigins) {
@@ -205,7 +210,10 @@ TEST(PointRefinement, IsDeterministic) {
   const Problem problem = MakeProblem(random);
   const Pose start = Disturb(problem, RandomPose(random, 0.3, 0.02));
   const auto a = RefineOnPoints(problem.local, problem.target, start, {});
-  const auto b = RefineOnPoints(problem.local, problem.target, start, {});
+  // Of a target that others were laid on before.
+  RefinementTarget target(problem.target, {});
+  target.Refine(problem.local, Disturb(problem, RandomPose(random, 0.3, 0.02)));
+  const auto b = target.Refine(problem.local, start);
   ASSERT_TRUE(a && b);
   EXPECT_EQ(a->T_target_local.matrix(), b->T_target_local.matrix());
   EXPECT_EQ(a->covariance, b->covariance);
@@ -306,6 +314,8 @@ TEST(PointRefinement, NamesTheParameterThatIsOutOfRange) {
   expect_refused("normal_radius_m", [](auto* p) { p->normal_radius_m = std::nan(""); });
   expect_refused("max_points", [](auto* p) { p->max_points = 0; });
   expect_refused("min_stiffness", [](auto* p) { p->min_stiffness = 0.0; });
+  expect_refused("floor_m", [](auto* p) { p->floor_m = -0.1; });
+  expect_refused("floor_rad", [](auto* p) { p->floor_rad = std::nan(""); });
   expect_refused("max_open_directions", [](auto* p) { p->max_open_directions = 6; });
 }
 
