@@ -1,11 +1,9 @@
 #include "apps/evaluate.hpp"
 
-#include <cmath>
 #include <cstdio>
 #include <filesystem>
 #include <map>
 #include <memory>
-#include <random>
 #include <string>
 
 #include "apps/no_bags.hpp"
@@ -51,16 +49,6 @@ std::unique_ptr<DriveSource> OpenDrive(const EvaluateArguments& arguments) {
   if (arguments.simulate) return std::make_unique<SimulatedDrive>(arguments.simulation.Resolve());
   if (!arguments.bag.path.empty()) return OpenBagDrive(arguments.bag);
   return std::make_unique<KittiDrive>(arguments.kitti);
-}
-
-// Anywhere within a kilometre, turned by any angle about the vertical.
-Pose RandomPlacement(unsigned seed) {
-  std::mt19937 random(seed);
-  std::uniform_real_distribution<double> uniform(-1.0, 1.0);
-  Pose T = Pose::Identity();
-  T.translation() << 1000.0 * uniform(random), 1000.0 * uniform(random), 10.0 * uniform(random);
-  T.linear() = Eigen::AngleAxisd(M_PI * uniform(random), Eigen::Vector3d::UnitZ()).toRotationMatrix();
-  return T;
 }
 
 // The truth of the map's drive: as given, or as saved with the map.

@@ -18,6 +18,8 @@
 #include "apps/simulated_drive.hpp"
 #include "apps/simulation_options.hpp"
 #include "evaluation/evaluation.hpp"
+#include "evaluation/kidnap_comparison.hpp"
+#include "evaluation/kidnapped_drive.hpp"
 #include "evaluation/kitti_io.hpp"
 #include "evaluation/run_table.hpp"
 #include "evaluation/thesis_page.hpp"
@@ -314,6 +316,65 @@ void AddThesisCommand(CLI::App& experiment) {
   });
 }
 
+struct KidnapArguments {
+  SimulationArguments simulation;
+  std::vector<std::string> drives;
+  std::vector<std::uint64_t> seeds{1};
+  std::string config;
+  std::string out;
+};
+
+void RunKidnap(const KidnapArguments& arguments) {
+  EvaluationParameters parameters;
+  if (!arguments.config.empty()) parameters.core = LoadParameters(arguments.config);
+  parameters.optimize = false;
+  const double refill_m = 2.0 * parameters.core.front_end.local_radius_m;
+  std::vector<KidnapComparison> comparisons;
+  for (const std::string& text : arguments.drives) {
+    const DriveName name = ParseDrive(text);
+    for (const std::uint64_t seed : arguments.seeds) {
+      SimulatedDrive drive(OptionsOf(arguments.simulation, name, seed));
+      const std::size_t half = drive.size() / 2;
+      KidnappedDrive kidnapped(drive, half, RandomPlacement(static_cast<unsigned>(seed)));
+      const auto run = [&](const std::string& what, DriveSource& source) {
+        const std::string folder = name.name + "_seed" + std::to_string(seed) + "_" + what;
+        ProgressBar bar(folder, source.size());
+        EvaluationResult result = incremental_segmatch::Evaluate(
+            source, parameters, [&](std::size_t done, std::size_t) { bar.Update(done); });
+        WriteResults(result, parameters, arguments.out + "/" + folder);
+        return result;
+      };
+      const EvaluationResult undisturbed = run("undisturbed", drive);
+      comparisons.push_back(CompareKidnapped(name.name + ", seed " + std::to_string(seed), undisturbed,
+                                             run("carried", kidnapped), half, refill_m));
+    }
+  }
+  WriteText(arguments.out + "/kidnap.md", KidnapMarkdown(comparisons));
+  WriteText(arguments.out + "/kidnap.json", KidnapJson(comparisons));
+  std::printf("\n%s\nwritten to %s: kidnap.md kidnap.json, and a folder for each run with its report.html\n",
+              KidnapMarkdown(comparisons).c_str(), arguments.out.c_str());
+}
+
+void AddKidnapCommand(CLI::App& experiment) {
+  const auto arguments = std::make_shared<KidnapArguments>();
+  CLI::App* command = experiment.add_subcommand(
+      "kidnap",
+      "A robot that is carried elsewhere half-way, odometry moved by a random rigid transform, beside the same drive\n"
+      "undisturbed: recognition takes no pose prior, so both recognise the same, but where the local map of the "
+      "carried\n"
+      "robot has still to fill again. Nothing is optimized.\n\n"
+      "  segmatch experiment kidnap --drives loops kitti/06.txt --seeds 1 2 --stride 2 --out kidnap\n");
+  command
+      ->add_option("--drives", arguments->drives, "preset routes or KITTI pose files, with :FIRST_FRAME:SCANS a part")
+      ->required();
+  command->add_option("--seeds", arguments->seeds, "of town, noise, drift and of where the robot is carried to")
+      ->capture_default_str();
+  command->add_option("--out", arguments->out, "folder to write into; made if need be")->required();
+  command->add_option("--config", arguments->config, "YAML with parameters that differ from the defaults");
+  AddSensorOptions(*command, &arguments->simulation);
+  command->callback([arguments] { RunKidnap(*arguments); });
+}
+
 }  // namespace
 
 void AddExperimentCommand(CLI::App& app) {
@@ -321,6 +382,7 @@ void AddExperimentCommand(CLI::App& app) {
   command->require_subcommand(1);
   AddMatrixCommand(*command);
   AddThesisCommand(*command);
+  AddKidnapCommand(*command);
 }
 
 }  // namespace incremental_segmatch::apps

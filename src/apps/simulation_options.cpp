@@ -43,6 +43,9 @@ void AddSensorOptions(CLI::App& command, SimulationArguments* arguments) {
   command.add_option("--sensor", options.sensor, "LiDAR")
       ->check(CLI::IsMember(simulator::SensorNames()))
       ->capture_default_str();
+  command.add_option("--sensor-height", options.sensor_height_m, "of the LiDAR over the ground (m)")
+      ->check(CLI::PositiveNumber)
+      ->capture_default_str();
   command.add_option("--stride", options.stride, "keep every n-th frame")
       ->check(CLI::PositiveNumber)
       ->capture_default_str();

@@ -2,13 +2,25 @@
 /// A robot that is carried elsewhere in the middle of a drive.
 #pragma once
 
+#include <cmath>
 #include <optional>
+#include <random>
 #include <string>
 #include <vector>
 
 #include "evaluation/drive_source.hpp"
 
 namespace incremental_segmatch {
+
+/// Anywhere within a kilometre, turned by any angle about the vertical.
+inline Pose RandomPlacement(unsigned seed) {
+  std::mt19937 random(seed);
+  std::uniform_real_distribution<double> uniform(-1.0, 1.0);
+  Pose T = Pose::Identity();
+  T.translation() << 1000.0 * uniform(random), 1000.0 * uniform(random), 10.0 * uniform(random);
+  T.linear() = Eigen::AngleAxisd(M_PI * uniform(random), Eigen::Vector3d::UnitZ()).toRotationMatrix();
+  return T;
+}
 
 /// A drive whose odometry from some scan on is moved by a rigid transform: T_moved_odom * T_odom_sensor. What
 /// recognition does must not depend on it. The other drive must outlive this one.

@@ -95,19 +95,16 @@ std::optional<Item> Town::ParkedAt(std::size_t index, double time_s) const {
     if (ToUnit(draw) < parameters_.parked_change) state = Mix(draw);
   }
   if (!(ToUnit(HashOf(state, 1)) < kOccupied)) return std::nullopt;
-  Item vehicle = RandomVehicle(parameters_.look_alike ? spot.seed : HashOf(state, 2));
-  if (!parameters_.look_alike) {
-    // Cars longer than the spot don't park there.
-    for (std::uint64_t again = 3; vehicle.footprint.half_m.x() > spot.footprint.half_m.x(); ++again) {
-      vehicle = RandomVehicle(HashOf(state, again));
-    }
+  Item vehicle = RandomVehicle(HashOf(state, 2));
+  // Cars longer than the spot don't park there.
+  for (std::uint64_t again = 3; vehicle.footprint.half_m.x() > spot.footprint.half_m.x(); ++again) {
+    vehicle = RandomVehicle(HashOf(state, again));
   }
   Random random(state);
   const double slack_x = std::max(0.0, spot.footprint.half_m.x() - vehicle.footprint.half_m.x());
   const Eigen::Vector2d shift(random.Uniform(-slack_x, slack_x), random.Uniform(-0.1, 0.1));
-  vehicle.footprint.yaw_rad = spot.footprint.yaw_rad + (parameters_.look_alike ? 0.0 : random.Uniform(-0.03, 0.03));
-  vehicle.footprint.centre_m = at;
-  if (!parameters_.look_alike) vehicle.footprint.centre_m += Eigen::Rotation2Dd(spot.footprint.yaw_rad) * shift;
+  vehicle.footprint.yaw_rad = spot.footprint.yaw_rad + random.Uniform(-0.03, 0.03);
+  vehicle.footprint.centre_m = at + Eigen::Rotation2Dd(spot.footprint.yaw_rad) * shift;
   return vehicle;
 }
 

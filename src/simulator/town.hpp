@@ -22,7 +22,7 @@ struct TownParameters {
   double parked_change = 0.4;        ///< chance that a parking spot changes between two visits more than 60 s apart
   double meetings_per_minute = 6.0;  ///< with oncoming vehicles
   double pedestrians_per_100m = 2.0;
-  bool look_alike = false;  ///< equal houses, trees and cars at equal distances
+  bool look_alike = false;  ///< equal houses, hedges, trees and lamps at equal distances; cars park by chance
 };
 
 /// Geometry and where it is now.

@@ -413,7 +413,8 @@ class Planner {
     }
   }
 
-  // Everything equal at equal distances: the seed of each kind is one and the same.
+  // Everything that is built or planted is equal, at equal distances: the seed of each kind is one and the same. Parking
+  // spots lie at equal distances too; which cars stand there is chance, as in reality.
   void LookAlikeSide(const StreetSide& side) {
     const auto add = [&](ItemKind kind, const Footprint& footprint, double height, double margin, std::uint64_t make) {
       plot_.Add({kind, footprint, height, HashOf(parameters_.seed, make), LowestLeaf(footprint)}, margin);
@@ -424,11 +425,11 @@ class Planner {
       for (int i = 0; i < 4; ++i)
         add(ItemKind::kHedge, side.At(along - 4.5 + 2.5 * i, side.profile().boundary_m, {0.4, 1.25}), 1.4, -0.03, 3);
       add(ItemKind::kTree, side.At(along + 6.0, side.profile().furniture_m, {0.18, 0.18}), 8.0, 0.5, 4);
-      add(ItemKind::kParkingSpot, Turned(side.At(along, kParkingRow_m, {2.6, 1.0}), -kPi / 2), 0.0, 0.2, 5);
-      add(ItemKind::kParkingSpot, Turned(side.At(along + 8.0, kParkingRow_m, {2.6, 1.0}), -kPi / 2), 0.0, 0.2, 5);
+      for (const double at : {along, along + 8.0})
+        AddSpot(Turned(side.At(at, kParkingRow_m, {2.6, 1.0}), -kPi / 2), 0.0);
     }
     for (double along = 20.0; along < side.length_m(); along += 32.0)
-      add(ItemKind::kLamp, side.At(along, side.profile().furniture_m, {0.15, 0.15}), 6.0, 0.3, 6);
+      add(ItemKind::kLamp, side.At(along, side.profile().furniture_m, {0.15, 0.15}), 6.0, 0.3, 5);
   }
 
   // Back rows: houses, sheds and trees on a jittered grid wherever the streets left room.

@@ -228,6 +228,15 @@ TEST_F(Drive, MatrixGathersRuns) {
   EXPECT_HAS(unknown.output, "nowhere");
 }
 
+TEST(Experiment, KidnappedBesideUndisturbed) {
+  const test::TemporaryDirectory directory;
+  const Outcome run = Segmatch("experiment kidnap --drives lap:0:4 --seeds 2 --sensor VLP-16 --out " + directory.path());
+  ASSERT_EQ(run.status, 0) << run.output;
+  EXPECT_HAS(run.output, "| lap_0_4, seed 2 | before | 2 |");
+  EXPECT_TRUE(std::filesystem::exists(directory.path() + "/lap_0_4_seed2_carried/report.html"));
+  EXPECT_TRUE(std::filesystem::exists(directory.path() + "/kidnap.json"));
+}
+
 TEST_F(Drive, BatchBesideIncremental) {
   const std::string drive = "evaluate --simulate --sensor VLP-16 --route lap --first-frame 20 --max-steps 4 ";
   const Outcome run = Segmatch(drive + "--pipeline both --out " + Out("both"));
