@@ -16,7 +16,8 @@ void AddDriveOptions(CLI::App& command, SimulationArguments* arguments) {
                                        "loops: streets revisited in the same and in the opposite direction;\n"
                                        "opposite: a long street there and back;\n"
                                        "deceptive: blocks of equal houses that invite false closures;\n"
-                                       "lap: one closed lap, see --laps")
+                                       "lap: one closed lap, see --laps;\n"
+                                       "office: corridors, rooms and furniture of an office floor, at 1 m/s")
                            ->check(CLI::IsMember(simulator::PresetRouteNames()))
                            ->capture_default_str();
   command

@@ -355,6 +355,64 @@ Primitives BuildPedestrian(const Item& item) {
       Primitive::Cylinder({0, 0, 0.84f * height}, {0, 0, height}, 0.1f, Material::kCloth)};
 }
 
+Primitives BuildPartition(const Item& item) {
+  const Vector2f half = item.footprint.half_m.cast<float>();
+  const float height = static_cast<float>(item.height_m);
+  return {Primitive::Box({0, 0, 0.5f * height}, {half.x(), half.y(), 0.5f * height}, Material::kPlaster)};
+}
+
+// Table top, sides, perhaps drawers, perhaps screens.
+Primitives BuildDesk(const Item& item) {
+  Random random(item.seed);
+  const Vector2f half = item.footprint.half_m.cast<float>();
+  const float height = static_cast<float>(item.height_m);
+  Primitives out{Primitive::Box({0, 0, height}, {half.x(), half.y(), 0.02f}, Material::kWood)};
+  for (const float side : {-1.f, 1.f}) {
+    out.push_back(Primitive::Box({0, side * (half.y() - 0.03f), 0.5f * height}, {half.x() - 0.05f, 0.02f, 0.5f * height},
+                                 Material::kWood));
+  }
+  if (random.Chance(0.6)) {
+    const float side = random.Chance(0.5) ? 1.f : -1.f;
+    out.push_back(Primitive::Box({0, side * (half.y() - 0.28f), 0.3f}, {half.x() - 0.08f, 0.2f, 0.29f}, Material::kMetal));
+  }
+  if (random.Chance(0.4))
+    out.push_back(Primitive::Box({0.05f - half.x(), 0, 0.5f * height}, {0.02f, half.y(), 0.35f * height}, Material::kWood));
+  for (int screens = random.Index(3), i = 0; i < screens; ++i) {
+    out.push_back(Primitive::Box({-0.6f * half.x(), (static_cast<float>(i) - 0.5f * static_cast<float>(screens - 1)) * 0.6f,
+                                  height + 0.28f},
+                                 {0.03f, 0.27f, 0.2f}, Material::kMetal));
+  }
+  return out;
+}
+
+Primitives BuildCabinet(const Item& item) {
+  const Vector2f half = item.footprint.half_m.cast<float>();
+  const float height = static_cast<float>(item.height_m);
+  return {Primitive::Box({0, 0, 0.5f * height}, {half.x(), half.y(), 0.5f * height}, Material::kWood)};
+}
+
+Primitives BuildPottedPlant(const Item& item) {
+  Random random(item.seed);
+  const float r = static_cast<float>(item.footprint.half_m.x()), height = static_cast<float>(item.height_m);
+  return {Primitive::Cylinder({0, 0, 0}, {0, 0, 0.35f}, 0.7f * r, Material::kPlaster),
+          Primitive::Foliage({0, 0, 0.5f * (height + 0.35f)}, {r, r, 0.5f * (height - 0.35f)}, true, 0.1f,
+                             random.UniformF(0.7, 1.1), Seed32(random))};
+}
+
+Primitives BuildCeiling(const Item& item) {
+  const Vector2f half = item.footprint.half_m.cast<float>();
+  return {Primitive::Box({0, 0, static_cast<float>(item.height_m) + 0.1f}, {half.x(), half.y(), 0.1f}, Material::kPlaster)};
+}
+
+// Looks towards +x.
+Primitives BuildChair(const Item&) {
+  return {Primitive::Box({0, 0, 0.47f}, {0.23f, 0.23f, 0.04f}, Material::kCloth),
+          Primitive::Box({-0.22f, 0, 0.78f}, {0.03f, 0.21f, 0.24f}, Material::kCloth),
+          Primitive::Cylinder({0, 0, 0.06f}, {0, 0, 0.45f}, 0.04f, Material::kMetal),
+          Primitive::Box({0, 0, 0.06f}, {0.26f, 0.03f, 0.03f}, Material::kMetal),
+          Primitive::Box({0, 0, 0.06f}, {0.03f, 0.26f, 0.03f}, Material::kMetal)};
+}
+
 }  // namespace
 
 std::vector<Primitive> BuildItem(const Item& item) {
@@ -391,7 +449,21 @@ std::vector<Primitive> BuildItem(const Item& item) {
       return BuildVehicle(item);
     case ItemKind::kPedestrian:
       return BuildPedestrian(item);
+    case ItemKind::kPartition:
+    case ItemKind::kPillar:
+      return BuildPartition(item);
+    case ItemKind::kDesk:
+      return BuildDesk(item);
+    case ItemKind::kCabinet:
+      return BuildCabinet(item);
+    case ItemKind::kPottedPlant:
+      return BuildPottedPlant(item);
+    case ItemKind::kCeiling:
+      return BuildCeiling(item);
+    case ItemKind::kChair:
+      return BuildChair(item);
     case ItemKind::kParkingSpot:
+    case ItemKind::kChairSpot:
       return {};
   }
   return {};

@@ -28,7 +28,15 @@ enum class ItemKind : std::uint8_t {
   kUtilityPole,
   kParkingSpot,  ///< a vehicle that depends on the visit
   kVehicle,
-  kPedestrian
+  kPedestrian,
+  kPartition,  ///< an inner wall of any height
+  kPillar,
+  kDesk,
+  kCabinet,
+  kPottedPlant,
+  kCeiling,
+  kChairSpot,  ///< a chair whose place depends on the visit
+  kChair
 };
 
 /// A planned thing. Its frame: origin on the ground at the footprint's centre, x along footprint.yaw_rad, z up.
@@ -41,8 +49,8 @@ struct Item {
   double lowest_leaf_m = 0.0;  ///< crowns begin at least this high: street trees are pruned
 };
 
-/// Geometry of an item in its own frame; a deterministic function of its argument. Parking spots have none of their
-/// own.
+/// Geometry of an item in its own frame; a deterministic function of its argument. Parking and chair spots have none of
+/// their own.
 std::vector<Primitive> BuildItem(const Item& item);
 
 /// A vehicle of a random make: footprint at the origin, to be placed.

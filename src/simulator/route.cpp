@@ -6,11 +6,15 @@
 #include <sstream>
 #include <stdexcept>
 
+#include "simulator/office_plan.hpp"
+
 namespace incremental_segmatch::simulator {
 namespace {
 
 constexpr double kLaneOffset_m = 1.75;   // the vehicle keeps to the right of the road's axis
 constexpr double kCornerRadius_m = 9.0;  // of the road's axis
+constexpr double kIndoorCornerRadius_m = 0.7;
+constexpr double kIndoorSpeed_m_s = 1.0;
 constexpr double kStep_m = 0.25;         // sampling of the path before it is driven
 constexpr double kLateralLimit_m_s2 = 2.0;
 constexpr double kBrakeLimit_m_s2 = 1.5;
@@ -28,15 +32,24 @@ void AppendLine(Path& path, const Eigen::Vector2d& to) {
   for (int i = 1; i <= steps; ++i) path.push_back(from + (to - from) * (static_cast<double>(i) / steps));
 }
 
-// The arc of the driven lane around a corner of the axis: tangent to both legs at kCornerRadius_m from the axis's arc
+// How a path follows its axis.
+struct Lane {
+  double offset_m;         // to the right
+  double corner_radius_m;  // of the axis
+};
+constexpr Lane kRoad{kLaneOffset_m, kCornerRadius_m};
+constexpr Lane kCorridor{0.0, kIndoorCornerRadius_m};
+
+// The arc of the driven lane around a corner of the axis: tangent to both legs at the corner's radius from the axis's arc
 // centre.
-void AppendCorner(Path& path, const Eigen::Vector2d& corner, const Eigen::Vector2d& in, const Eigen::Vector2d& out) {
+void AppendCorner(Path& path, const Lane& lane, const Eigen::Vector2d& corner, const Eigen::Vector2d& in,
+                  const Eigen::Vector2d& out) {
   const double turn = std::atan2(Cross(in, out), in.dot(out));
   const double side = turn > 0 ? 1.0 : -1.0;
-  const double tangent = kCornerRadius_m * std::tan(std::abs(turn) / 2);
+  const double tangent = lane.corner_radius_m * std::tan(std::abs(turn) / 2);
   const Eigen::Vector2d normal(-in.y(), in.x());
-  const Eigen::Vector2d centre = corner - in * tangent + normal * side * kCornerRadius_m;
-  const double radius = kCornerRadius_m + side * kLaneOffset_m;
+  const Eigen::Vector2d centre = corner - in * tangent + normal * side * lane.corner_radius_m;
+  const double radius = lane.corner_radius_m + side * lane.offset_m;
   const Eigen::Vector2d start = centre - normal * side * radius;
   AppendLine(path, start);
   const int steps = std::max(2, static_cast<int>(std::ceil(std::abs(turn) * radius / kStep_m)));
@@ -49,17 +62,17 @@ void AppendCorner(Path& path, const Eigen::Vector2d& corner, const Eigen::Vector
 }
 
 // The lane driven along an axis given by its corners.
-Path LaneAlong(const std::vector<Eigen::Vector2d>& corners) {
+Path PathAlong(const std::vector<Eigen::Vector2d>& corners, const Lane& lane) {
   const auto right = [](const Eigen::Vector2d& d) { return Eigen::Vector2d(d.y(), -d.x()); };
   const Eigen::Vector2d first = (corners[1] - corners[0]).normalized();
-  Path path{corners[0] + kLaneOffset_m * right(first)};
+  Path path{corners[0] + lane.offset_m * right(first)};
   for (std::size_t i = 1; i + 1 < corners.size(); ++i) {
     const Eigen::Vector2d in = (corners[i] - corners[i - 1]).normalized();
     const Eigen::Vector2d out = (corners[i + 1] - corners[i]).normalized();
-    if (std::abs(Cross(in, out)) > 1e-6) AppendCorner(path, corners[i], in, out);
+    if (std::abs(Cross(in, out)) > 1e-6) AppendCorner(path, lane, corners[i], in, out);
   }
   const Eigen::Vector2d last = (corners.back() - corners[corners.size() - 2]).normalized();
-  AppendLine(path, corners.back() + kLaneOffset_m * right(last));
+  AppendLine(path, corners.back() + lane.offset_m * right(last));
   return path;
 }
 
@@ -167,22 +180,37 @@ Corners LapCorners(int laps) {
   return corners;
 }
 
+Corners OfficeCorners() {
+  // Twice around the ring of corridors, then through the one in the middle and half of the ring the other way.
+  constexpr double kX = kOfficeLength_m, kY = kOfficeWidth_m;
+  const Corners lap{{kX, 0}, {kX, kY}, {0, kY}, {0, 0}};
+  Corners corners{{4, 0}};
+  for (int i = 0; i < 2; ++i) corners.insert(corners.end(), lap.begin(), lap.end());
+  corners.insert(corners.end(), {{kX / 2, 0}, {kX / 2, kY}, {kX, kY}, {kX, 0}, {4, 0}});
+  return corners;
+}
+
 }  // namespace
 
 std::vector<std::string> PresetRouteNames() {
-  return {"loops", "opposite", "deceptive", "lap"};
+  return {"loops", "opposite", "deceptive", "lap", "office"};
 }
 
 Route MakePresetRoute(const std::string& name, const RouteParameters& parameters) {
   if (!(parameters.frame_rate_hz > 0)) throw std::invalid_argument("scan rate must be positive");
   if (!(parameters.speed_m_s > 0)) throw std::invalid_argument("speed must be positive");
   if (parameters.laps < 1) throw std::invalid_argument("laps must be at least 1");
-  if (name == "loops") return Drive(LaneAlong(LoopsCorners()), parameters);
-  if (name == "opposite") return Drive(LaneAlong(OppositeCorners()), parameters);
-  if (name == "deceptive") return Drive(LaneAlong(DeceptiveCorners()), parameters);
-  if (name == "lap") return Drive(LaneAlong(LapCorners(parameters.laps)), parameters);
+  if (name == "loops") return Drive(PathAlong(LoopsCorners(), kRoad), parameters);
+  if (name == "opposite") return Drive(PathAlong(OppositeCorners(), kRoad), parameters);
+  if (name == "deceptive") return Drive(PathAlong(DeceptiveCorners(), kRoad), parameters);
+  if (name == "lap") return Drive(PathAlong(LapCorners(parameters.laps), kRoad), parameters);
+  if (name == "office") {
+    RouteParameters walked = parameters;
+    walked.speed_m_s = std::min(parameters.speed_m_s, kIndoorSpeed_m_s);
+    return Drive(PathAlong(OfficeCorners(), kCorridor), walked);
+  }
   throw std::invalid_argument("unknown route '" + name +
-                              "': use loops, opposite, deceptive or lap, or give a pose file");
+                              "': use loops, opposite, deceptive, lap or office, or give a pose file");
 }
 
 Route RouteFromKittiPoses(const std::string& file, double frame_rate_hz) {

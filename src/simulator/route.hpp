@@ -23,11 +23,11 @@ using Route = std::vector<RouteFrame>;
 /// How a preset route is driven.
 struct RouteParameters {
   double frame_rate_hz = 10.0;
-  double speed_m_s = 7.0;  ///< on straights; corners are taken more slowly
+  double speed_m_s = 7.0;  ///< on straights; corners are taken more slowly, and an office at 1 m/s at most
   int laps = 2;            ///< of the preset "lap"
 };
 
-/// Names of the preset routes: loops, opposite, deceptive, lap.
+/// Names of the preset routes: loops, opposite, deceptive, lap, office.
 std::vector<std::string> PresetRouteNames();
 
 /// A preset route; throws std::invalid_argument for an unknown name or a non-positive rate or speed.

@@ -36,7 +36,11 @@ TownParameters TownOf(const SimulationOptions& options) {
   TownParameters town = options.town;
   town.seed = options.seed;
   town.day = options.day;
-  town.look_alike = town.look_alike || (options.poses_file.empty() && options.route == "deceptive");
+  if (!options.poses_file.empty()) return town;
+  if (options.route == "deceptive") town.world = World::kLookAlike;
+  if (options.route != "office") return town;
+  town.world = World::kOffice;
+  town.grade = town.meetings_per_minute = town.pedestrians_per_100m = 0.0;
   return town;
 }
 

@@ -30,7 +30,7 @@ struct SimulationOptions {
   DriftParameters drift;
   double range_noise_m = 0.02;
   double dropout = 0.02;  ///< share of beams lost even in the best case
-  TownParameters town;    ///< seed, day and look_alike are set from the options above
+  TownParameters town;    ///< seed, day and world are set from the options above
 };
 
 /// Points with their intensities (0..1), ring by ring from the top, counter-clockwise from the x axis in each ring.

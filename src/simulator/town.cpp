@@ -12,11 +12,16 @@ constexpr double kCell_m = 32.0;
 constexpr double kMargin_m = 150.0;  // ground around the path
 constexpr double kForget_m = 250.0;  // geometry farther than this is dropped
 constexpr double kVisitRadius_m = 80.0;
+constexpr double kIndoorVisitRadius_m = 15.0;
 constexpr double kVisitGap_s = 20.0;
 constexpr double kChangeGap_s = 60.0;
 constexpr double kOccupied = 0.72;
 constexpr double kMeetingSpan_s = 9.0;
 constexpr double kOncomingLane_m = 3.5;
+
+bool IsSpot(ItemKind kind) {
+  return kind == ItemKind::kParkingSpot || kind == ItemKind::kChairSpot;
+}
 
 std::uint64_t CellKey(const Eigen::Vector2d& p) {
   const auto x = static_cast<std::int64_t>(std::floor(p.x() / kCell_m)),
@@ -44,7 +49,10 @@ Town::Town(const Route& route, const TownParameters& parameters)
   for (std::uint32_t i = 0; i < plan_.size(); ++i) {
     const Eigen::Vector2d& at = plan_[i].footprint.centre_m;
     cells_[CellKey(at)].push_back(i);
-    if (plan_[i].kind == ItemKind::kParkingSpot) visits_[i] = trajectory_.Visits(at, kVisitRadius_m, kVisitGap_s);
+    if (IsSpot(plan_[i].kind)) {
+      const double radius_m = plan_[i].kind == ItemKind::kChairSpot ? kIndoorVisitRadius_m : kVisitRadius_m;
+      visits_[i] = trajectory_.Visits(at, radius_m, kVisitGap_s);
+    }
   }
   PlanTraffic();
 }
@@ -81,9 +89,9 @@ PlacedItem Town::Place(const Item& item, std::shared_ptr<const std::vector<Primi
   return placed;
 }
 
-std::optional<Item> Town::ParkedAt(std::size_t index, double time_s) const {
+// What stands on a spot is drawn from this: it changes by chance between visits, and from day to day.
+std::uint64_t Town::StateOf(std::size_t index, double time_s) const {
   const Item& spot = plan_.at(index);
-  const Eigen::Vector2d& at = spot.footprint.centre_m;
   std::uint64_t state = HashOf(spot.seed, 17);
   if (parameters_.day != 0 && ToUnit(HashOf(spot.seed, 18, parameters_.day)) < parameters_.parked_change * 1.3) {
     state = HashOf(spot.seed, 19, parameters_.day);
@@ -93,6 +101,21 @@ std::optional<Item> Town::ParkedAt(std::size_t index, double time_s) const {
     if (visits[k].begin_s - visits[k - 1].end_s < kChangeGap_s) continue;
     const std::uint64_t draw = HashOf(spot.seed, k, parameters_.day);
     if (ToUnit(draw) < parameters_.parked_change) state = Mix(draw);
+  }
+  return state;
+}
+
+std::optional<Item> Town::StandsOn(std::size_t index, double time_s) const {
+  const Item& spot = plan_.at(index);
+  const Eigen::Vector2d& at = spot.footprint.centre_m;
+  const std::uint64_t state = StateOf(index, time_s);
+  if (spot.kind == ItemKind::kChairSpot) {
+    Random random(state);
+    Item chair{ItemKind::kChair, spot.footprint, 1.0, spot.seed, 0.0};
+    chair.footprint.centre_m = at + Eigen::Vector2d(random.Uniform(-0.2, 0.2), random.Uniform(-0.2, 0.2));
+    chair.footprint.yaw_rad += random.Uniform(-0.6, 0.6);
+    chair.footprint.half_m = {0.26, 0.26};
+    return chair;
   }
   if (!(ToUnit(HashOf(state, 1)) < kOccupied)) return std::nullopt;
   Item vehicle = RandomVehicle(HashOf(state, 2));
@@ -135,9 +158,9 @@ std::vector<PlacedItem> Town::ItemsNear(const Eigen::Vector2d& position_m, doubl
   std::vector<PlacedItem> items;
   for (const std::uint32_t index : near) {
     const Item& item = plan_[index];
-    if (item.kind == ItemKind::kParkingSpot) {
-      if (const std::optional<Item> vehicle = ParkedAt(index, time_s)) {
-        items.push_back(Place(*vehicle, std::make_shared<const std::vector<Primitive>>(BuildItem(*vehicle))));
+    if (IsSpot(item.kind)) {
+      if (const std::optional<Item> now = StandsOn(index, time_s)) {
+        items.push_back(Place(*now, std::make_shared<const std::vector<Primitive>>(BuildItem(*now))));
       }
       continue;
     }

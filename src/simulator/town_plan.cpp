@@ -1,7 +1,8 @@
 #include <algorithm>
 #include <cmath>
-#include <unordered_map>
 
+#include "simulator/office_plan.hpp"
+#include "simulator/plot.hpp"
 #include "simulator/random.hpp"
 #include "simulator/town.hpp"
 
@@ -12,67 +13,6 @@ constexpr double kPi = 3.14159265358979323846;
 constexpr double kAxisLeftOfVehicle_m = 1.75;
 constexpr double kHalfRoad_m = 3.5;
 constexpr double kParkingRow_m = 0.85;  // parked cars' middle beyond the kerb
-constexpr double kCell_m = 16.0;
-
-double Clearance(ItemKind kind) {
-  switch (kind) {
-    case ItemKind::kHouse:
-      return 2.8;
-    case ItemKind::kShed:
-      return 2.8;
-    case ItemKind::kParkingSpot:
-      return 1.55;
-    default:
-      return 1.9;
-  }
-}
-
-// Keeps the accepted items apart from each other and from the driven path.
-class Plot {
- public:
-  explicit Plot(const TrajectoryIndex& trajectory) : trajectory_(trajectory) {}
-
-  bool IsFree(const Item& item, double margin_m) const {
-    const double clearance =
-        Clearance(item.kind) + (item.kind == ItemKind::kTree || item.kind == ItemKind::kBush ? 0.5 : 0.0);
-    if (trajectory_.Distance(item.footprint, clearance) < clearance) return false;
-    bool free = true;
-    ForEachCell(item.footprint, margin_m, [&](std::uint64_t key) {
-      const auto cell = cells_.find(key);
-      if (cell == cells_.end()) return;
-      for (const std::uint32_t index : cell->second) {
-        free = free && !Overlap(items_[index].footprint, item.footprint, margin_m);
-      }
-    });
-    return free;
-  }
-
-  bool Add(const Item& item, double margin_m) {
-    if (!IsFree(item, margin_m)) return false;
-    ForEachCell(item.footprint, 0.0,
-                [&](std::uint64_t key) { cells_[key].push_back(static_cast<std::uint32_t>(items_.size())); });
-    items_.push_back(item);
-    return true;
-  }
-
-  std::vector<Item> Take() { return std::move(items_); }
-
- private:
-  template <typename Function>
-  static void ForEachCell(const Footprint& footprint, double margin_m, Function function) {
-    const double reach = footprint.half_m.norm() + margin_m;
-    const auto cell = [](double v) { return static_cast<std::int64_t>(std::floor(v / kCell_m)); };
-    for (std::int64_t x = cell(footprint.centre_m.x() - reach); x <= cell(footprint.centre_m.x() + reach); ++x) {
-      for (std::int64_t y = cell(footprint.centre_m.y() - reach); y <= cell(footprint.centre_m.y() + reach); ++y) {
-        function((static_cast<std::uint64_t>(x) << 32) ^ (static_cast<std::uint64_t>(y) & 0xffffffffULL));
-      }
-    }
-  }
-
-  const TrajectoryIndex& trajectory_;
-  std::vector<Item> items_;
-  std::unordered_map<std::uint64_t, std::vector<std::uint32_t>> cells_;
-};
 
 // What lies beside the carriageway; metres are outwards from the kerb.
 struct Profile {
@@ -129,11 +69,15 @@ District DistrictAt(const Eigen::Vector2d& position_m, std::uint64_t seed, Rando
 class Planner {
  public:
   Planner(const TrajectoryIndex& trajectory, const TownParameters& parameters)
-      : trajectory_(trajectory), parameters_(parameters), random_(HashOf(parameters.seed, 3003)), plot_(trajectory) {}
+      : trajectory_(trajectory),
+        parameters_(parameters),
+        is_look_alike_(parameters.world == World::kLookAlike),
+        random_(HashOf(parameters.seed, 3003)),
+        plot_(trajectory) {}
 
   std::vector<Item> Run() {
     const std::vector<StreetSide> sides = FreshSides();
-    if (parameters_.look_alike) {
+    if (is_look_alike_) {
       for (const StreetSide& side : sides) LookAlikeSide(side);
     } else {
       for (const StreetSide& side : sides) Lots(side);
@@ -168,9 +112,9 @@ class Planner {
   // A long street changes its face now and then.
   void AppendSections(std::vector<StreetSide>& sides, double begin, double end, bool left) {
     while (begin < end) {
-      const double length = parameters_.look_alike ? end - begin : random_.Uniform(60.0, 140.0);
-      const bool parking = parameters_.look_alike || random_.Chance(0.6);
-      const double pavement = parameters_.look_alike ? 1.6 : random_.Uniform(1.3, 2.6);
+      const double length = is_look_alike_ ? end - begin : random_.Uniform(60.0, 140.0);
+      const bool parking = is_look_alike_ || random_.Chance(0.6);
+      const double pavement = is_look_alike_ ? 1.6 : random_.Uniform(1.3, 2.6);
       const double furniture = parking ? 2.2 : 0.45;
       sides.emplace_back(trajectory_, begin, std::min(end, begin + length), left,
                          Profile{parking, furniture, furniture - 0.3 + pavement});
@@ -466,6 +410,7 @@ class Planner {
 
   const TrajectoryIndex& trajectory_;
   const TownParameters& parameters_;
+  bool is_look_alike_;
   Random random_;
   Plot plot_;
 };
@@ -473,7 +418,8 @@ class Planner {
 }  // namespace
 
 std::vector<Item> PlanTown(const TrajectoryIndex& trajectory, const TownParameters& parameters) {
-  return Planner(trajectory, parameters).Run();
+  return parameters.world == World::kOffice ? PlanOffice(trajectory, parameters.seed)
+                                            : Planner(trajectory, parameters).Run();
 }
 
 }  // namespace incremental_segmatch::simulator

@@ -92,7 +92,7 @@ TEST(SimulationTest, AnotherDayKeepsTheTownAndChangesTheCars) {
   for (std::size_t i = 0; i < plan.size(); ++i) {
     ASSERT_EQ(plan[i].seed, tomorrow.town().plan()[i].seed);
     if (plan[i].kind != ItemKind::kParkingSpot) continue;
-    const auto a = today.town().ParkedAt(i, 0.0), b = tomorrow.town().ParkedAt(i, 0.0);
+    const auto a = today.town().StandsOn(i, 0.0), b = tomorrow.town().StandsOn(i, 0.0);
     ++spots;
     changed += a.has_value() != b.has_value() || (a && a->seed != b->seed);
   }
@@ -147,7 +147,7 @@ TEST(SimulationTest, TheDeceptiveStreetIsOfEqualThingsAtEqualDistances) {
     makes[item.kind].insert(item.seed);
     places[item.kind].push_back(item.footprint.centre_m);
     for (double time_s = 0.0; item.kind == ItemKind::kParkingSpot && time_s < 400.0; time_s += 20.0) {
-      if (const std::optional<Item> parked = town.ParkedAt(i, time_s)) makes[ItemKind::kVehicle].insert(parked->seed);
+      if (const std::optional<Item> parked = town.StandsOn(i, time_s)) makes[ItemKind::kVehicle].insert(parked->seed);
     }
   }
   for (const ItemKind kind : {ItemKind::kHouse, ItemKind::kHedge, ItemKind::kTree, ItemKind::kLamp})
@@ -164,11 +164,36 @@ TEST(SimulationTest, TheDeceptiveStreetIsOfEqualThingsAtEqualDistances) {
   EXPECT_GT(in_step, places[ItemKind::kHouse].size() * 3 / 4);
 }
 
+TEST(SimulationTest, TheOfficeHasFurnitureAndItsChairsAreMoved) {
+  const Simulation simulation(Options("office"));
+  const Town& town = simulation.town();
+  std::map<ItemKind, std::size_t> counts;
+  std::size_t seen_again = 0, moved = 0;
+  for (std::size_t i = 0; i < town.plan().size(); ++i) {
+    const Item& item = town.plan()[i];
+    ++counts[item.kind];
+    if (item.kind != ItemKind::kChairSpot) continue;
+    const std::vector<Visit> visits = town.trajectory().Visits(item.footprint.centre_m, 15.0, 20.0);
+    for (std::size_t k = 1; k < visits.size(); ++k) {
+      if (visits[k].begin_s - visits[k - 1].end_s < 60.0) continue;
+      ++seen_again;
+      const Footprint before = town.StandsOn(i, visits[k - 1].end_s)->footprint, after = town.StandsOn(i, visits[k].begin_s)->footprint;
+      moved += before.centre_m != after.centre_m;
+    }
+  }
+  for (const ItemKind kind : {ItemKind::kDesk, ItemKind::kCabinet, ItemKind::kPottedPlant, ItemKind::kPillar})
+    EXPECT_GE(counts[kind], 10u) << static_cast<int>(kind);
+  EXPECT_EQ(counts[ItemKind::kCeiling], 1u);
+  ASSERT_GT(seen_again, 20u);
+  EXPECT_GT(moved, seen_again / 5);
+  EXPECT_LT(moved, seen_again * 3 / 5);
+}
+
 TEST(SimulationTest, ParkedCarsChangeOnlyBetweenVisitsAMinuteApart) {
   Simulation simulation(Options("loops"));
   const Town& town = simulation.town();
   const auto state = [&](std::size_t spot, double time_s) {
-    const auto parked = town.ParkedAt(spot, time_s);
+    const auto parked = town.StandsOn(spot, time_s);
     return parked ? parked->seed : std::uint64_t{0};
   };
   std::size_t returns = 0, changed = 0;
@@ -201,7 +226,11 @@ TEST(SimulationTest, SensorIsUprightAtItsHeightOverTheGround) {
       low = std::min(low, ground);
       high = std::max(high, ground);
     }
-    EXPECT_GT(high - low, 0.3) << "the town has no slopes";
+    if (route == "office") {
+      EXPECT_EQ(high, low) << "floors are flat";
+    } else {
+      EXPECT_GT(high - low, 0.3) << "the town has no slopes";
+    }
   }
 }
 
@@ -209,20 +238,22 @@ TEST(SimulationTest, NothingStandsWhereTheVehiclePasses) {
   // The vehicle's body against the planned footprints, and the sensor's surroundings against all geometry.
   for (const std::string& route : PresetRouteNames()) {
     SCOPED_TRACE(route);
+    const bool indoors = route == "office";
+    const Eigen::Vector2d body = indoors ? Eigen::Vector2d(0.4, 0.35) : Eigen::Vector2d(1.0, 0.9);
     Simulation simulation(Options(route));
     for (std::size_t i = 0; i < simulation.size(); i += 3) {
       const Eigen::Vector2d p = simulation.T_world_sensor(i).translation().head<2>();
       const double yaw =
           std::atan2(simulation.T_world_sensor(i).linear()(1, 0), simulation.T_world_sensor(i).linear()(0, 0));
-      const Footprint vehicle{p, yaw, {1.0, 0.9}};
+      const Footprint vehicle{p, yaw, body};
       for (const Item& item : simulation.town().plan()) {
-        if ((item.footprint.centre_m - p).norm() > 25.0) continue;
+        if (item.kind == ItemKind::kCeiling || (item.footprint.centre_m - p).norm() > 25.0) continue;
         ASSERT_FALSE(Overlap(vehicle, item.footprint, 0.0)) << "scan " << i << ", kind " << static_cast<int>(item.kind);
       }
       if (i % 15 != 0) continue;
       float nearest = 100.f;
       for (const Eigen::Vector3f& point : simulation.Scan(i)) nearest = std::min(nearest, point.head<2>().norm());
-      EXPECT_GT(nearest, 1.4f) << "scan " << i;
+      EXPECT_GT(nearest, indoors ? 0.6f : 1.4f) << "scan " << i;
     }
   }
 }
