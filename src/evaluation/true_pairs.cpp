@@ -30,6 +30,31 @@ struct PlacedView {
   Eigen::Vector3d centroid_world;
 };
 
+struct Ranked {
+  std::size_t rank;  // from 1
+  double distance;   // scaled
+};
+
+// Of a segment among all that are open to the robot, in the order of TargetIndex::Nearest; nothing if it is not open. All
+// views are gone through: sorting them all for each query would be the larger part of a run.
+std::optional<Ranked> RankOf(const SegmentKey& segment, const Descriptor& query, RobotIndex robot,
+                             const TargetIndex& index) {
+  std::vector<std::pair<float, SegmentKey>> views;
+  float own = std::numeric_limits<float>::infinity();
+  for (std::uint64_t item = 0; item < index.next_item(); ++item) {
+    if (!index.IsOpen(item, robot)) continue;
+    const IndexedView& view = index.view(item);
+    views.emplace_back(index.Distance(query, view.descriptor), view.segment);
+    if (view.segment == segment) own = std::min(own, views.back().first);
+  }
+  if (own == std::numeric_limits<float>::infinity()) return std::nullopt;
+  std::set<SegmentKey> before;
+  for (const auto& view : views) {
+    if (view < std::make_pair(own, segment)) before.insert(view.second);
+  }
+  return Ranked{before.size() + 1, own};
+}
+
 }  // namespace
 
 TruePairFinder::TruePairFinder(const TrueTrajectory& truth, const TrueTrajectory* map_truth,
@@ -103,15 +128,11 @@ std::vector<TruePair> TruePairFinder::Step(std::size_t step, const SegmentDelta&
     pair.centroid_difference_m = nearest_m;
     pair.size_ratio = static_cast<double>(std::min(local.size, target->size)) /
                       static_cast<double>(std::max({local.size, target->size, 1u}));
-    const std::vector<TargetCandidate> ranked =
-        back_end.targets().Nearest(local.descriptor, robot, 0, std::numeric_limits<float>::infinity());
-    const auto found = std::find_if(ranked.begin(), ranked.end(),
-                                    [&](const TargetCandidate& c) { return c.segment == pair.target; });
-    if (found != ranked.end()) {
+    if (const std::optional<Ranked> ranked = RankOf(pair.target, local.descriptor, robot, back_end.targets())) {
       pair.allowed = true;
-      pair.rank = static_cast<std::size_t>(found - ranked.begin()) + 1;
+      pair.rank = ranked->rank;
       pair.nearest = matching.nearest == 0 || pair.rank <= static_cast<std::size_t>(matching.nearest);
-      pair.within = pair.nearest && (matching.max_distance == 0.0 || found->distance <= matching.max_distance);
+      pair.within = pair.nearest && (matching.max_distance == 0.0 || ranked->distance <= matching.max_distance);
     }
     pair.consistent = consistent.count({pair.local, pair.target}) != 0;
     pairs.push_back(pair);

@@ -39,7 +39,7 @@ class TruePairFinder {
                  double max_difference_m = 1.0);
 
   /// The pairs of a step of the drive, of which the back end has just processed the delta; none unless the step is a
-  /// revisit. To be called for every step, in order, before the map is corrected. At revisits O(targets) per pair.
+  /// revisit. To be called for every step, in order, before the map is corrected. At revisits O(views) per pair.
   std::vector<TruePair> Step(std::size_t step, const SegmentDelta& delta, const BackEndStep& recognized,
                              const BackEnd& back_end);
 

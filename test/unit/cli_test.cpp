@@ -228,6 +228,23 @@ TEST_F(Drive, MatrixGathersRuns) {
   EXPECT_HAS(unknown.output, "nowhere");
 }
 
+TEST(Presets, FindSegmentsWithTheirSensors) {
+  const test::TemporaryDirectory directory;
+  const std::string street = "--route lap --first-frame 100 --stride 2 ", office = "--route office --stride 5 ";
+  for (const auto& [preset, drive] : {std::make_pair("hdl64e", street + "--sensor HDL-64E"),
+                                      std::make_pair("hdl32e", street + "--sensor HDL-32E"),
+                                      std::make_pair("vlp16", street + "--sensor VLP-16"),
+                                      std::make_pair("os1_128", street + "--sensor OS1-128"),
+                                      std::make_pair("indoor", office + "--sensor VLP-16 --sensor-height 0.6")}) {
+    SCOPED_TRACE(preset);
+    const Outcome run = Segmatch(std::string("evaluate --simulate --max-steps 12 ") + drive + " --config " +
+                                 SEGMATCH_SOURCE_DIR "/config/" + preset + ".yaml --out " + directory.path());
+    ASSERT_EQ(run.status, 0) << run.output;
+    std::ifstream file(directory.path() + "/summary.json");
+    EXPECT_GT(nlohmann::json::parse(file)["counts"]["segments"]["max"], 25.0);
+  }
+}
+
 TEST(Experiment, KidnappedBesideUndisturbed) {
   const test::TemporaryDirectory directory;
   const Outcome run = Segmatch("experiment kidnap --drives lap:0:4 --seeds 2 --sensor VLP-16 --out " + directory.path());

@@ -115,6 +115,13 @@ TEST(TruePairs, ARevisitHasThoseThatTheTruthJoins) {
     pairs = finder.Step(i, visits.deltas[i], step, back_end);
     EXPECT_EQ(pairs.empty(), i < 3) << "only the last step is a revisit";
   }
+  // The rank is the place in the list that matching would get without a limit.
+  for (const TruePair& pair : pairs) {
+    const std::vector<TargetCandidate> all =
+        back_end.targets().Nearest(Looks(ValueAgain(static_cast<int>(pair.local.id) - 11)), 0, 0, 1e9f);
+    EXPECT_EQ(all.size(), 7u);
+    EXPECT_TRUE(!pair.allowed || all[pair.rank - 1].segment == pair.target);
+  }
   // Segment 7 is tracked still, and is not open to its own robot. Without it the target of object 2 is the fifth.
   ExpectPairs(pairs, 0, false);
   for (const int k : {0, 1, 3, 4, 5}) EXPECT_TRUE(pairs[static_cast<std::size_t>(k)].consistent) << k;
