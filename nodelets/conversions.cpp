@@ -83,6 +83,8 @@ std::uint8_t ToCause(RetirementCause cause) {
       return SegmentRetirement::TOO_LARGE;
     case RetirementCause::kCut:
       return SegmentRetirement::CUT;
+    case RetirementCause::kTrail:
+      return SegmentRetirement::TRAIL;
     case RetirementCause::kLeft:
       break;
   }
@@ -95,6 +97,8 @@ RetirementCause FromCause(const SegmentRetirement& retired) {
       return RetirementCause::kTooLarge;
     case SegmentRetirement::CUT:
       return RetirementCause::kCut;
+    case SegmentRetirement::TRAIL:
+      return RetirementCause::kTrail;
     case SegmentRetirement::LEFT:
       return RetirementCause::kLeft;
     default:
@@ -359,7 +363,8 @@ NamedCounts ToNamedCounts(const FrontEndCounts& counts) {
           {"segments", counts.clusters.segments},
           {"too_small", counts.clusters.too_small},
           {"too_large", counts.clusters.too_large},
-          {"cut", counts.clusters.cut}};
+          {"cut", counts.clusters.cut},
+          {"trails", counts.clusters.trails}};
 }
 
 NamedCounts ToNamedCounts(const BackEndCounts& counts) {

@@ -276,7 +276,7 @@ void BackEnd::RetireSegment(RobotIndex robot, const RetiredSegment& retired) {
 
   SegmentKey key{robot, retired.id};
   index_.Remove(key);
-  if (retired.cause == RetirementCause::kTooLarge) {
+  if (retired.cause == RetirementCause::kTooLarge || retired.cause == RetirementCause::kTrail) {
     map_.Erase(key);
     return;
   }

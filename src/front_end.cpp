@@ -45,6 +45,7 @@ FrontEnd::FrontEnd(const FrontEndParameters& parameters, std::string robot)
       grid_(parameters.grid),
       normals_(MakeNormals(parameters, grid_)),
       segmenter_(MakeSegmenter(parameters, grid_, normals_.get())),
+      trail_finder_(parameters.trails),
       describer_(parameters.descriptor, parameters.grid.resolution_m) {
   Validate(parameters.local_radius_m, parameters.view);
   if (!(parameters.local_path_m > 0.0)) throw std::invalid_argument("front_end.local_path_m: must be positive");
@@ -86,8 +87,18 @@ FrontEndStep FrontEnd::Process(const Scan& scan) {
     normals_->Remove(left.removed);
     timer.Lap("normal_removal");
   }
-  const SegmentUpdate left_segments = segmenter_->Remove(left.removed);
+  SegmentUpdate left_segments = segmenter_->Remove(left.removed);
+  trail_finder_.Follow(left_segments);
   timer.Lap("segment_removal");
+
+  auto thinned_sensor = std::make_shared<const Points>(ThinScan(scan.points_sensor, parameters_.thinning));
+  timer.Lap("scan_thinning");
+
+  const SegmentUpdate trails = segmenter_->DismissTrails(
+      trail_finder_.Look(scan.stamp_ns, *thinned_sensor, scan.T_odom_sensor, grid_, *segmenter_));
+  trail_finder_.Follow(trails);
+  left_segments.retired.insert(left_segments.retired.end(), trails.retired.begin(), trails.retired.end());
+  timer.Lap("trail_search");
 
   const VoxelUpdate inserted = grid_.Insert(filtered.obstacles_sensor, scan.T_odom_sensor);
   timer.Lap("voxel_insertion");
@@ -96,14 +107,15 @@ FrontEndStep FrontEnd::Process(const Scan& scan) {
     timer.Lap("normals");
   }
   const SegmentUpdate grown_segments = segmenter_->Insert(inserted);
+  trail_finder_.Add(inserted.activated, grid_);
+  trail_finder_.Follow(grown_segments);
   timer.Lap("segmentation");
 
   step.delta = DescribeChanges(left_segments, grown_segments);
   ShowViews(VoxelsSeen(inserted), &step.delta);
   timer.Lap("description");
 
-  step.delta.scan_sensor = std::make_shared<const Points>(ThinScan(scan.points_sensor, parameters_.thinning));
-  timer.Lap("scan_thinning");
+  step.delta.scan_sensor = std::move(thinned_sensor);
 
   step.times = timer.Take();
   step.counts.points = scan.points_sensor.size();
@@ -238,7 +250,7 @@ std::vector<LocalPoint> FrontEnd::LocalCloud() const {
 }
 
 std::size_t FrontEnd::memory_bytes() const {
-  return grid_.memory_bytes() + segmenter_->memory_bytes() + (normals_ ? normals_->memory_bytes() : 0);
+  return grid_.memory_bytes() + segmenter_->memory_bytes() + trail_finder_.memory_bytes() + (normals_ ? normals_->memory_bytes() : 0);
 }
 
 }  // namespace incremental_segmatch

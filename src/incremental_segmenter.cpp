@@ -61,6 +61,19 @@ SegmentUpdate IncrementalSegmenter<Policy>::Insert(const VoxelUpdate& update) {
   return Settle();
 }
 
+template <class Policy>
+SegmentUpdate IncrementalSegmenter<Policy>::DismissTrails(const std::vector<SegmentId>& trails) {
+  SegmentUpdate update;
+  for (const SegmentId segment : trails) {
+    Cluster& cluster = clusters_[TrackedIndex(segment)];
+    SetState(&cluster, State::kTrail);
+    cluster.id = kNoSegment;
+    Untrack(segment);
+    update.retired.push_back({segment, RetirementCause::kTrail});
+  }
+  return update;
+}
+
 /// Moved centroids are deltas of their clusters' moments. They come block by block, and most blocks are of one cluster.
 template <class Policy>
 void IncrementalSegmenter<Policy>::FollowCentroids(const std::vector<MovedVoxel>& moved_voxels) {
@@ -295,8 +308,7 @@ typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::Link(
   kept.live_voxels += absorbed.live_voxels;
   if (absorbed.id != kNoSegment) kept.absorbed.push_back(absorbed.id);
   kept.absorbed.insert(kept.absorbed.end(), absorbed.absorbed.begin(), absorbed.absorbed.end());
-  if (absorbed.state == State::kTooLarge || (absorbed.state == State::kCut && kept.state != State::kTooLarge))
-    SetState(&kept, absorbed.state);
+  if (absorbed.state > std::max(kept.state, State::kSegment)) SetState(&kept, absorbed.state);
   kept.grew = true;
   MarkDirty(&kept);
 
@@ -362,7 +374,7 @@ void IncrementalSegmenter<Policy>::SettleCluster(ClusterIndex index, SegmentUpda
     }
     Track(cluster.id, index);
     if (grew) update->grown.push_back(cluster.id);
-  } else if (size >= parameters_.min_cluster_size) {
+  } else if (cluster.state != State::kTrail && size >= parameters_.min_cluster_size) {
     SetState(&cluster, State::kSegment);
     cluster.id = next_id_++;
     Track(cluster.id, index);
@@ -376,6 +388,7 @@ std::size_t& IncrementalSegmenter<Policy>::CountOf(State state) {
     case State::kSmall: return counts_.too_small;
     case State::kSegment: return counts_.segments;
     case State::kTooLarge: return counts_.too_large;
+    case State::kTrail: return counts_.trails;
     default: return counts_.cut;
   }
 }
@@ -411,16 +424,16 @@ void IncrementalSegmenter<Policy>::Untrack(SegmentId segment) {
 }
 
 template <class Policy>
-const typename IncrementalSegmenter<Policy>::Cluster& IncrementalSegmenter<Policy>::TrackedCluster(SegmentId segment) const {
+typename IncrementalSegmenter<Policy>::ClusterIndex IncrementalSegmenter<Policy>::TrackedIndex(SegmentId segment) const {
   const auto at = std::lower_bound(tracked_.begin(), tracked_.end(), std::make_pair(segment, ClusterIndex{0}));
   if (at == tracked_.end() || at->first != segment)
     throw std::invalid_argument("segment " + std::to_string(segment) + " is not tracked");
-  return clusters_[at->second];
+  return at->second;
 }
 
 template <class Policy>
 const SegmentMoments& IncrementalSegmenter<Policy>::Moments(SegmentId segment) const {
-  return TrackedCluster(segment).moments;
+  return clusters_[TrackedIndex(segment)].moments;
 }
 
 template <class Policy>

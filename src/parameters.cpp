@@ -196,6 +196,9 @@ Interval Between(double low, double high) {
 Interval Inside(double low, double high) {
   return {low, false, high, false};
 }
+Interval AboveUpTo(double low, double high) {
+  return {low, false, high, true};
+}
 Interval OrInfinite(Interval interval) {
   interval.high_included = true;
   return interval;
@@ -330,6 +333,16 @@ const std::vector<Parameter>& Table() {
       NUMBER(front_end.thinning.min_range_m, AtLeast(0), "points nearer than this horizontally don't"),
       NUMBER(front_end.thinning.max_range_m, Above(0), "nor those farther away; more than `min_range_m`"),
       NUMBER(front_end.thinning.max_points, AtLeast(1), "so many points of a scan are looked at"),
+
+      CHOICE(front_end.trails.enabled, "segments that are trails of moving objects are dropped"),
+      NUMBER(front_end.trails.interval_s, Above(0),
+             "a voxel is looked at once more, so long after it came, or up to twice as long"),
+      NUMBER(front_end.trails.min_range_m, AtLeast(0), "nearer voxels wait: a thinned scan has gaps there"),
+      NUMBER(front_end.trails.tolerance_m, Above(0),
+             "a return so near to a voxel confirms it; one farther by twice as much sees through it"),
+      NUMBER(front_end.trails.min_voxels, AtLeast(1), "a segment is judged by at least so many of its voxels"),
+      NUMBER(front_end.trails.min_share, AboveUpTo(0, 1),
+             "of them seen through, from which on a segment is a trail"),
 
       CHOICE(back_end.mode,
              "the target map is what the robots of this run have seen so far; or it is loaded and fixed"),

@@ -43,6 +43,25 @@ RangeImage::RangeImage(const Points& scan_sensor) : cells_(kRows * kColumns) {
   }
 }
 
+Sight RangeImage::Look(const Eigen::Vector3f& point_sensor, float tolerance_m) const {
+  const std::optional<Direction> direction = DirectionOf(point_sensor);
+  if (!direction) return Sight::kUnknown;
+  const float range = point_sensor.norm();
+  int returns = 0;
+  bool is_confirmed = false, is_behind_all = true;
+  for (int row = std::max(0, direction->row - 1); row <= std::min(kRows - 1, direction->row + 1); ++row) {
+    for (int step = kColumns - 1; step <= kColumns + 1; ++step) {
+      const Cell& cell = cells_[static_cast<std::size_t>(row * kColumns + (direction->column + step) % kColumns)];
+      if (cell.farthest == 0.f) continue;
+      ++returns;
+      is_confirmed = is_confirmed || (cell.nearest - tolerance_m <= range && range <= cell.farthest + tolerance_m);
+      is_behind_all = is_behind_all && cell.nearest > range + 2.f * tolerance_m;
+    }
+  }
+  if (returns < kMinReturns) return Sight::kUnknown;
+  return is_confirmed ? Sight::kConfirmed : is_behind_all ? Sight::kSeenThrough : Sight::kUnknown;
+}
+
 FreeSpaceCounts RangeImage::Compare(const Points& points, const Pose& T_image_points, double slack_m,
                                     const FreeSpaceParameters& parameters) const {
   const Eigen::Matrix3f R = T_image_points.linear().cast<float>();
@@ -54,24 +73,10 @@ FreeSpaceCounts RangeImage::Compare(const Points& points, const Pose& T_image_po
   for (const Eigen::Vector3f& point : points) {
     if (point.z() < min_height) continue;
     const Eigen::Vector3f p = R * point + t;
-    const float range = p.norm();
-    if (range > max_range) continue;
-    const std::optional<Direction> direction = DirectionOf(p);
-    if (!direction) continue;
-    int returns = 0;
-    bool is_confirmed = false, is_behind_all = true;
-    for (int row = std::max(0, direction->row - 1); row <= std::min(kRows - 1, direction->row + 1); ++row) {
-      for (int step = kColumns - 1; step <= kColumns + 1; ++step) {
-        const Cell& cell = cells_[static_cast<std::size_t>(row * kColumns + (direction->column + step) % kColumns)];
-        if (cell.farthest == 0.f) continue;
-        ++returns;
-        is_confirmed = is_confirmed || (cell.nearest - tolerance <= range && range <= cell.farthest + tolerance);
-        is_behind_all = is_behind_all && cell.nearest > range + 2.f * tolerance;
-      }
-    }
-    if (returns < kMinReturns) continue;
-    counts.confirmed += is_confirmed;
-    counts.seen_through += is_behind_all;
+    if (p.norm() > max_range) continue;
+    const Sight sight = Look(p, tolerance);
+    counts.confirmed += sight == Sight::kConfirmed;
+    counts.seen_through += sight == Sight::kSeenThrough;
   }
   return counts;
 }

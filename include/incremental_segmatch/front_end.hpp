@@ -17,6 +17,7 @@
 #include "incremental_segmatch/scan_thinning.hpp"
 #include "incremental_segmatch/segment_delta.hpp"
 #include "incremental_segmatch/stage_times.hpp"
+#include "incremental_segmatch/trail_finder.hpp"
 #include "incremental_segmatch/types.hpp"
 
 namespace incremental_segmatch {
@@ -43,6 +44,7 @@ struct FrontEndParameters {
   DescriptorParameters descriptor;  ///< features of a segment
   ViewParameters view;              ///< when a view is kept
   ScanThinningParameters thinning;  ///< of the scan that goes along, for refinement
+  TrailParameters trails;           ///< which segments are trails of moving objects
 };
 
 /// The robot side's part of the funnel.
@@ -127,6 +129,7 @@ class FrontEnd {
   DynamicVoxelGrid grid_;
   std::unique_ptr<IncrementalNormals> normals_;  // only where the growing policy reads them
   std::unique_ptr<Segmenter> segmenter_;
+  TrailFinder trail_finder_;
   Describer describer_;
   std::unordered_map<SegmentId, Tracked> tracked_;
   std::uint64_t sequence_ = 0;

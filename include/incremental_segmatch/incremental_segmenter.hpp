@@ -33,7 +33,8 @@ struct SegmenterParameters {
 enum class RetirementCause {
   kTooLarge,  ///< it was no segment: it leaves the map
   kCut,       ///< partly left the local map (kInvalidate), or merged with such a cluster: its views stay
-  kLeft       ///< all its points have left the local map: its views stay
+  kLeft,      ///< all its points have left the local map: its views stay
+  kTrail      ///< it is the trail of a moving object, and was no segment: it leaves the map
 };
 
 /// A segment that is tracked no longer.
@@ -64,6 +65,7 @@ struct ClusterCounts {
   std::size_t too_small = 0;  ///< of them, too small so far
   std::size_t too_large = 0;  ///< of them, too large
   std::size_t cut = 0;        ///< of them, cut by the boundary
+  std::size_t trails = 0;     ///< of them, trails of moving objects
 };
 
 /// Clusters the active voxels of a grid as they come and keeps track of segments: what IncrementalSegmenter is to those
@@ -77,6 +79,11 @@ class Segmenter {
 
   /// Clusters activated voxels and follows moved centroids.
   virtual SegmentUpdate Insert(const VoxelUpdate& update) = 0;
+
+  /// Segments turned out to be trails of moving objects: they are segments no more. What such a cluster merges with
+  /// stays, or becomes, what it is: a segment goes on with the trail as a part of it. Throws std::invalid_argument if one
+  /// is not tracked. O(trails log segments).
+  virtual SegmentUpdate DismissTrails(const std::vector<SegmentId>& trails) = 0;
 
   /// Sums over a segment's voxels. O(1).
   virtual const SegmentMoments& Moments(SegmentId segment) const = 0;
@@ -107,6 +114,7 @@ class IncrementalSegmenter final : public Segmenter {
 
   SegmentUpdate Remove(const std::vector<RemovedVoxel>& removed) override;
   SegmentUpdate Insert(const VoxelUpdate& update) override;
+  SegmentUpdate DismissTrails(const std::vector<SegmentId>& trails) override;
   const SegmentMoments& Moments(SegmentId segment) const override;
   SegmentId SegmentOf(VoxelHandle voxel) const override;
   std::vector<SegmentId> Segments() const override;
@@ -122,7 +130,7 @@ class IncrementalSegmenter final : public Segmenter {
   static constexpr Label kNoLabel = 0xffffffffu;  // of a block without clustered voxels
   static constexpr Label kMixed = 0xfffffffeu;    // of a block with voxels of several labels
 
-  enum class State : std::uint8_t { kFree, kSmall, kSegment, kTooLarge, kCut };
+  enum class State : std::uint8_t { kFree, kSmall, kSegment, kTrail, kCut, kTooLarge };  // of two that link, the later
 
   // A label: node of the union-find forest.
   struct Node {
@@ -186,7 +194,7 @@ class IncrementalSegmenter final : public Segmenter {
   std::size_t& CountOf(State state);
   void Track(SegmentId segment, ClusterIndex cluster);
   void Untrack(SegmentId segment);
-  const Cluster& TrackedCluster(SegmentId segment) const;
+  ClusterIndex TrackedIndex(SegmentId segment) const;
 
   SegmenterParameters parameters_;
   const DynamicVoxelGrid* grid_;

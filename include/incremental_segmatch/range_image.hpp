@@ -34,11 +34,22 @@ struct FreeSpaceParameters {
   double tolerance_m = 0.5;   ///< a return so near to a point confirms it; one farther by twice as much sees through
 };
 
+/// What an image says of a point.
+enum class Sight {
+  kUnknown,     ///< hidden, beside the returns, or with returns both nearer and farther around it
+  kConfirmed,   ///< there is a return where it is
+  kSeenThrough  ///< there is nothing but farther returns around it: it is not there
+};
+
 /// Nearest and farthest return in each cell of a panorama of 2 degrees by 1.5 degrees. Immutable.
 class RangeImage {
  public:
   /// Points in the sensor's frame (m). O(points).
   explicit RangeImage(const Points& scan_sensor);
+
+  /// Looks where a point is, in the image's sensor frame (m): a return within the tolerance confirms it, returns farther
+  /// by twice as much, all around, see through it. O(1).
+  Sight Look(const Eigen::Vector3f& point_sensor, float tolerance_m) const;
 
   /// Holds another scan's points against the image. `slack_m` is added to the tolerance: what odometry may have drifted
   /// in between. Points beside the image's returns, or hidden behind them, count for nothing. O(points).

@@ -165,6 +165,7 @@ std::vector<FunnelColumn> FunnelColumns() {
           {"clusters_too_small", [](const StepRecord& s) { return s.front_end.clusters.too_small; }},
           {"clusters_too_large", [](const StepRecord& s) { return s.front_end.clusters.too_large; }},
           {"clusters_cut", [](const StepRecord& s) { return s.front_end.clusters.cut; }},
+          {"clusters_trails", [](const StepRecord& s) { return s.front_end.clusters.trails; }},
           {"segments", [](const StepRecord& s) { return s.front_end.clusters.segments; }},
           {"described", [](const StepRecord& s) { return s.described; }},
           {"target_segments", [](const StepRecord& s) { return s.back_end.target_segments; }},

@@ -54,6 +54,10 @@ class Reference {
   bool IsCut(int root) const {
     return std::any_of(cut_.begin(), cut_.end(), [&](int index) { return Find(index) == root; });
   }
+  void Dismiss(VoxelHandle voxel) { dismissed_.insert(by_handle_.at(voxel)); }
+  bool IsTrail(int root) const {
+    return std::any_of(dismissed_.begin(), dismissed_.end(), [&](int index) { return Find(index) == root; });
+  }
 
  private:
   struct Member {
@@ -70,7 +74,7 @@ class Reference {
   const DynamicVoxelGrid* grid_;
   std::vector<Member> members_;
   std::map<VoxelHandle, int> by_handle_;
-  std::set<int> cut_;
+  std::set<int> cut_, dismissed_;
 };
 
 /// What a consumer of the events knows.
@@ -145,11 +149,17 @@ void ExpectAgreement(const DynamicVoxelGrid& grid, const IncrementalSegmenter<Eu
   EXPECT_EQ(segmenter.counts().segments, segments.size());
 }
 
+VoxelHandle AnyVoxel(const Reference& reference, const IncrementalSegmenter<EuclideanPolicy>& segmenter, SegmentId segment) {
+  const auto found = std::find_if(reference.by_handle().begin(), reference.by_handle().end(),
+                                  [&](const auto& entry) { return segmenter.SegmentOf(entry.first) == segment; });
+  return found->first;
+}
+
 class SegmenterSequences : public ::testing::TestWithParam<BoundaryPolicy> {};
 
 TEST_P(SegmenterSequences, ClustersAreComponentsAndIdsFollowTheRules) {
-  std::size_t renamings = 0, retirements = 0, too_large = 0;
-  for (unsigned seed = 0; seed < 200; ++seed) {
+  std::size_t renamings = 0, retirements = 0, too_large = 0, trails = 0;
+  for (unsigned seed = 0; seed < 400; ++seed) {
     SCOPED_TRACE("seed " + std::to_string(seed));
     std::mt19937 random(seed);
     DynamicVoxelGridParameters grid_parameters;
@@ -171,6 +181,14 @@ TEST_P(SegmenterSequences, ClustersAreComponentsAndIdsFollowTheRules) {
       reference.Remove(left.removed);
       const SegmentUpdate removal = segmenter.Remove(left.removed);
       ledger.Apply(removal);
+      std::vector<SegmentId> dismissed;
+      for (const SegmentId segment : segmenter.Segments())
+        if (seed % 4 == 3 && random() % 2 == 0) dismissed.push_back(segment);
+      for (const SegmentId segment : dismissed) reference.Dismiss(AnyVoxel(reference, segmenter, segment));
+      const SegmentUpdate dismissal = segmenter.DismissTrails(dismissed);
+      EXPECT_EQ(dismissal.retired.size(), dismissed.size());
+      ledger.Apply(dismissal);
+      trails += dismissed.size();
 
       Points points;
       const int objects = std::uniform_int_distribution<int>(0, 5)(random);
@@ -184,6 +202,9 @@ TEST_P(SegmenterSequences, ClustersAreComponentsAndIdsFollowTheRules) {
       reference.Insert(inserted.activated);
       const SegmentUpdate growth = segmenter.Insert(inserted);
       ledger.Apply(growth);
+      for (const SegmentId created : growth.created)
+        EXPECT_FALSE(reference.IsTrail(reference.Component(AnyVoxel(reference, segmenter, created))))
+            << "a trail became a segment by itself";
 
       renamings += growth.renamed.size();
       for (const SegmentUpdate* update : {&removal, &growth})
@@ -198,6 +219,7 @@ TEST_P(SegmenterSequences, ClustersAreComponentsAndIdsFollowTheRules) {
   EXPECT_GT(renamings, 50u) << "the sequences should exercise merging";
   EXPECT_GT(retirements, 200u);
   EXPECT_GT(too_large, 10u);
+  EXPECT_GT(trails, 50u);
 }
 
 INSTANTIATE_TEST_SUITE_P(BothBoundaries, SegmenterSequences,

@@ -56,7 +56,7 @@ SegmentDelta RandomDelta(std::mt19937& random) {
     p = (40.0 * Eigen::Vector3d(unit(random), unit(random), unit(random))).cast<float>();
   delta.scan_sensor = scan;
   delta.renamed = {{12, 5}, {30, 2}};
-  delta.retired = {{40, RetirementCause::kTooLarge}, {41, RetirementCause::kCut}, {42, RetirementCause::kLeft}};
+  delta.retired = {{40, RetirementCause::kTooLarge}, {41, RetirementCause::kCut}, {42, RetirementCause::kLeft}, {43, RetirementCause::kTrail}};
   return delta;
 }
 

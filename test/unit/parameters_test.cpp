@@ -294,6 +294,7 @@ TEST(Parameters, EveryMemberOfEveryStructIsInTheTable) {
   EXPECT_EQ(entries("back_end.free_space"), CountMembers<FreeSpaceParameters>());
   EXPECT_EQ(entries("back_end.keyframes"), CountMembers<KeyframeParameters>());
   EXPECT_EQ(entries("front_end.thinning"), CountMembers<ScanThinningParameters>());
+  EXPECT_EQ(entries("front_end.trails"), CountMembers<TrailParameters>());
   EXPECT_EQ(entries("back_end.refinement"), CountMembers<RefinementParameters>());
   EXPECT_EQ(entries("back_end.acceptance"), CountMembers<AcceptanceParameters>());
   EXPECT_EQ(entries("back_end.target_map"), CountMembers<TargetMapParameters>());
