@@ -19,6 +19,8 @@ namespace {
 constexpr double kWarnPeriod_s = 5.0;
 constexpr double kRequestPeriod_s = 1.0;
 constexpr double kMemoryPeriod_s = 2.0;
+constexpr double kCorrection_m = 0.02;    // of a corrected pose, from which on the map follows
+constexpr double kCorrection_rad = 0.001;  // likewise
 constexpr double kLabelRadius_m = 40.0;  // around the robot
 constexpr double kLetter_m = 0.7;
 constexpr double kResidualExaggeration = 10.0;
@@ -143,8 +145,13 @@ void BackEndNodelet::Subscribe(const std::string& robot) {
   const boost::function<void(const nav_msgs::PathConstPtr&)> on_path = [this, robot](const nav_msgs::PathConstPtr& m) {
     worker_->PostAlways([this, robot, m] { CorrectTrajectory(robot, *m); });
   };
+  const boost::function<void(const nav_msgs::OdometryConstPtr&)> on_pose =
+      [this, robot](const nav_msgs::OdometryConstPtr& m) {
+        worker_->PostAlways([this, robot, m] { CorrectPose(robot, *m); });
+      };
   subscribers_.push_back(nh.subscribe<SegmentArray>(prefix + "segments", 100, on_segments));
   subscribers_.push_back(nh.subscribe<nav_msgs::Path>(prefix + "trajectory", 1, on_path));
+  subscribers_.push_back(nh.subscribe<nav_msgs::Odometry>(prefix + "corrected_odometry", 100, on_pose));
 }
 
 void BackEndNodelet::StartOver() {
@@ -333,26 +340,62 @@ void BackEndNodelet::RequestFullState(const std::string& topic) {
                  topic.c_str(), service.c_str());
 }
 
-void BackEndNodelet::CorrectTrajectory(const std::string& robot_name, const nav_msgs::Path& path) {
-  if (!back_end_ || IsLocalization()) return;
+/// Sessions of the robot whose corrections come on a topic, in order of time; an empty name stands for the only robot.
+std::vector<std::string> BackEndNodelet::SessionsOf(const std::string& robot_name) {
+  std::vector<std::pair<StampNs, std::string>> sessions;  // by their first stamps
   for (const auto& [session, robot] : robots_) {
     if (!robot_name.empty() && robot.name != robot_name) continue;
     if (robot_name.empty() && robot.name != robots_.begin()->second.name) {
       if (throttle_.IsDue("trajectory", kWarnPeriod_s))
         NODELET_WARN(
             "several robots send segments on one topic: whose trajectory is corrected? Set the parameter robots");
-      return;
+      return {};
     }
     const std::optional<RobotIndex> index = FindRobot(back_end_->map(), session);
-    if (!index || back_end_->map().Trajectory(*index).empty()) continue;
-    const std::vector<TrajectoryPose>& known = back_end_->map().Trajectory(*index);
-    std::vector<StampedPose> corrected = ToTrajectory(path, parameters_.trajectory_kind, robot.frames);
+    if (index && !back_end_->map().Trajectory(*index).empty())
+      sessions.emplace_back(back_end_->map().Trajectory(*index).front().stamp_ns, session);
+  }
+  std::sort(sessions.begin(), sessions.end());
+  std::vector<std::string> names;
+  for (const auto& [stamp_ns, session] : sessions) names.push_back(session);
+  return names;
+}
+
+void BackEndNodelet::CorrectTrajectory(const std::string& robot_name, const nav_msgs::Path& path) {
+  if (!back_end_ || IsLocalization()) return;
+  for (const std::string& session : SessionsOf(robot_name)) {
+    const std::vector<TrajectoryPose>& known = back_end_->map().Trajectory(*FindRobot(back_end_->map(), session));
+    std::vector<StampedPose> corrected =
+        ToTrajectory(path, parameters_.trajectory_kind, robots_.at(session).frames);
     const auto is_other_sessions = [&known](const StampedPose& pose) {
       return pose.stamp_ns < known.front().stamp_ns || pose.stamp_ns > known.back().stamp_ns;
     };
     corrected.erase(std::remove_if(corrected.begin(), corrected.end(), is_other_sessions), corrected.end());
     if (!corrected.empty()) back_end_->CorrectTrajectory(session, corrected);
   }
+}
+
+/// A corrected pose says nothing of those before it: they stay as they were corrected when they came. The map follows once
+/// it would be off by more than centimetres.
+void BackEndNodelet::CorrectPose(const std::string& robot_name, const nav_msgs::Odometry& odometry) {
+  if (!back_end_ || IsLocalization()) return;
+  const std::vector<std::string> sessions = SessionsOf(robot_name);
+  if (sessions.empty()) return;
+  const std::string& session = sessions.back();
+  Robot& robot = robots_.at(session);
+  const Pose T_base_sensor =
+      parameters_.trajectory_kind == FrameKind::kBase ? robot.frames.T_base_sensor : Pose::Identity();
+  const StampedPose pose{ToStampNs(odometry.header.stamp),
+                         ToPose(odometry.pose.pose, "corrected_odometry") * T_base_sensor};
+  if (!robot.corrected.empty() && pose.stamp_ns <= robot.corrected.back().stamp_ns) return;
+  robot.corrected.push_back(pose);
+
+  const RobotIndex index = *FindRobot(back_end_->map(), session);
+  const std::optional<Pose> T_odom_sensor = back_end_->map().OdometryAt(index, pose.stamp_ns);
+  if (!T_odom_sensor) return;  // the scan comes later: the next pose takes it along
+  const Pose error = (back_end_->map().T_map_odom(index) * *T_odom_sensor).inverse() * pose.T_frame_sensor;
+  if (error.translation().norm() < kCorrection_m && Eigen::AngleAxisd(error.linear()).angle() < kCorrection_rad) return;
+  back_end_->CorrectTrajectory(session, robot.corrected);
 }
 
 void BackEndNodelet::Publish(const BackEndStep& step, const std::string& session, Robot& robot) {

@@ -6,6 +6,7 @@
 #include <geometry_msgs/PointStamped.h>
 #include <incremental_segmatch/LoadMap.h>
 #include <incremental_segmatch/SaveMap.h>
+#include <nav_msgs/Odometry.h>
 #include <nav_msgs/Path.h>
 #include <nodelet/nodelet.h>
 #include <ros/ros.h>
@@ -35,7 +36,7 @@ namespace incremental_segmatch {
 /// missing makes it ask the robot's front end for a full state. A wrong parameter is FATAL, and the nodelet then stays
 /// idle.
 ///
-/// Subscribes `segments` and `trajectory`, or `<robot>/segments` and `<robot>/trajectory`; `clicked_point`. Publishes
+/// Subscribes `segments`, `trajectory` and `corrected_odometry`, or the same below `<robot>/`; `clicked_point`. Publishes
 /// `loop_closures`; `localization` and tf (in localization); for rviz `target_segments`, `target_labels`,
 /// `refused_matches`, `accepted_matches`, `residuals`, `closure_lines`, `selected_segment`; `back_end_steps`;
 /// diagnostics. Serves `save_map`, `load_map`, `reset`, `trigger`, and dynamic_reconfigure below `~tuning`.
@@ -55,6 +56,7 @@ class BackEndNodelet : public nodelet::Nodelet {
     Pose T_odom_continuous = Pose::Identity();  ///< jumps of odometry
     std::optional<Pose> T_map_continuous;       ///< of the last recognition
     double path_m = 0.0;
+    std::vector<StampedPose> corrected;         ///< that came one by one: T_map_sensor, ascending stamps
     std::optional<double> published_path_m;  ///< at the last published closure
     StampNs published_ns = 0;
   };
@@ -103,7 +105,9 @@ class BackEndNodelet : public nodelet::Nodelet {
   void ProcessSegments(const SegmentArray& message, const std::string& topic);
   Robot& Meet(const std::string& session, const SegmentArray& message);
   void RequestFullState(const std::string& topic);
+  std::vector<std::string> SessionsOf(const std::string& robot);
   void CorrectTrajectory(const std::string& robot, const nav_msgs::Path& path);
+  void CorrectPose(const std::string& robot, const nav_msgs::Odometry& odometry);
   void Publish(const BackEndStep& step, const std::string& session, Robot& robot);
   bool IsDue(const Closure& closure, const Robot& robot) const;
   void PublishClosure(const Closure& closure, Robot& robot);

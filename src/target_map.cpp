@@ -5,28 +5,6 @@
 #include <tuple>
 
 namespace incremental_segmatch {
-namespace {
-
-/// Odometry at a stamp within the trajectory, interpolated between the two poses around it.
-std::optional<Pose> OdometryAt(const std::vector<TrajectoryPose>& trajectory, StampNs stamp_ns) {
-  const auto after = std::lower_bound(trajectory.begin(), trajectory.end(), stamp_ns,
-                                      [](const TrajectoryPose& pose, StampNs stamp) { return pose.stamp_ns < stamp; });
-  if (after == trajectory.end()) return std::nullopt;
-  if (after->stamp_ns == stamp_ns) return after->T_odom_sensor;
-  if (after == trajectory.begin()) return std::nullopt;
-  const TrajectoryPose& before = *std::prev(after);
-  const double share =
-      static_cast<double>(stamp_ns - before.stamp_ns) / static_cast<double>(after->stamp_ns - before.stamp_ns);
-  const Eigen::Quaterniond rotation =
-      Eigen::Quaterniond(before.T_odom_sensor.linear()).slerp(share, Eigen::Quaterniond(after->T_odom_sensor.linear()));
-  Pose T_odom_sensor = Pose::Identity();
-  T_odom_sensor.linear() = rotation.toRotationMatrix();
-  T_odom_sensor.translation() =
-      (1.0 - share) * before.T_odom_sensor.translation() + share * after->T_odom_sensor.translation();
-  return T_odom_sensor;
-}
-
-}  // namespace
 
 TargetMap::TargetMap(const TargetMapParameters& parameters) : parameters_(parameters) {
   if (parameters.max_views < 1) {
@@ -65,6 +43,25 @@ void TargetMap::AddKeyframe(RobotIndex robot_index, std::shared_ptr<const Points
   robot.keyframes.push_back({static_cast<std::uint32_t>(robot.trajectory.size() - 1), std::move(scan_sensor)});
 }
 
+std::optional<Pose> TargetMap::OdometryAt(RobotIndex robot, StampNs stamp_ns) const {
+  const std::vector<TrajectoryPose>& trajectory = Trajectory(robot);
+  const auto after = std::lower_bound(trajectory.begin(), trajectory.end(), stamp_ns,
+                                      [](const TrajectoryPose& pose, StampNs stamp) { return pose.stamp_ns < stamp; });
+  if (after == trajectory.end()) return std::nullopt;
+  if (after->stamp_ns == stamp_ns) return after->T_odom_sensor;
+  if (after == trajectory.begin()) return std::nullopt;
+  const TrajectoryPose& before = *std::prev(after);
+  const double share =
+      static_cast<double>(stamp_ns - before.stamp_ns) / static_cast<double>(after->stamp_ns - before.stamp_ns);
+  const Eigen::Quaterniond rotation =
+      Eigen::Quaterniond(before.T_odom_sensor.linear()).slerp(share, Eigen::Quaterniond(after->T_odom_sensor.linear()));
+  Pose T_odom_sensor = Pose::Identity();
+  T_odom_sensor.linear() = rotation.toRotationMatrix();
+  T_odom_sensor.translation() =
+      (1.0 - share) * before.T_odom_sensor.translation() + share * after->T_odom_sensor.translation();
+  return T_odom_sensor;
+}
+
 void TargetMap::CorrectTrajectory(RobotIndex robot_index, const std::vector<StampedPose>& T_map_sensor) {
   Robot& robot = robots_.at(robot_index);
   struct Correction {
@@ -78,7 +75,7 @@ void TargetMap::CorrectTrajectory(RobotIndex robot_index, const std::vector<Stam
     if (!pose.T_frame_sensor.matrix().allFinite()) {
       throw std::invalid_argument("target map: a corrected pose of robot '" + robot.name + "' is not finite");
     }
-    const std::optional<Pose> T_odom_sensor = OdometryAt(robot.trajectory, pose.stamp_ns);
+    const std::optional<Pose> T_odom_sensor = OdometryAt(robot_index, pose.stamp_ns);
     if (!T_odom_sensor) continue;
     corrections.push_back({pose.stamp_ns, pose.T_frame_sensor, pose.T_frame_sensor * T_odom_sensor->inverse()});
   }

@@ -9,7 +9,7 @@
 namespace incremental_segmatch {
 namespace {
 
-constexpr std::size_t kSampleEvery = 4;    // voxels
+constexpr std::size_t kSampleEvery = 8;    // voxels
 constexpr double kSamePlace_voxels = 2.0;  // a voxel's centroid stays within its cell
 
 }  // namespace

@@ -76,6 +76,9 @@ class TargetMap {
   std::uint32_t AddPose(RobotIndex robot, StampNs stamp_ns, const Pose& T_odom_sensor);
   /// Trajectory of a robot, stamps ascending.
   const std::vector<TrajectoryPose>& Trajectory(RobotIndex robot) const { return robots_.at(robot).trajectory; }
+  /// Where a robot's odometry had the sensor at a stamp within its trajectory, interpolated; none before and after it.
+  /// O(log trajectory).
+  std::optional<Pose> OdometryAt(RobotIndex robot, StampNs stamp_ns) const;
   /// T_map_odom of a robot now.
   const Pose& T_map_odom(RobotIndex robot) const { return robots_.at(robot).T_map_odom; }
   /// A corrected trajectory, in any order: poses at corrected stamps are taken as they are; the others follow the

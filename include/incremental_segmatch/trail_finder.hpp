@@ -19,12 +19,12 @@ struct TrailParameters {
   double interval_s = 1.0;      ///< between looks; a voxel is looked at once, so long after it came, or up to twice
   double min_range_m = 5.0;     ///< nearer voxels wait: a thinned scan has gaps there
   double tolerance_m = 0.5;     ///< a return so near confirms a voxel; one farther by twice as much sees through it
-  std::size_t min_voxels = 10;  ///< a segment is judged by at least so many of its voxels
+  std::size_t min_voxels = 8;   ///< a segment is judged by at least so many of its voxels
   double min_share = 0.5;       ///< of the judged voxels seen through, from which on a segment is a trail
 };
 
 /// Looks at voxels again some time after they came. Of something that stood there, something still stands there, or it
-/// is hidden; where a car was that drove on, the ground or the wall behind it is seen. One voxel of four is looked at,
+/// is hidden; where a car was that drove on, the ground or the wall behind it is seen. One voxel of eight is looked at,
 /// once, so that the cost follows what is new. A car that stood for long and then drove off stays: its voxels were looked
 /// at while it was there. Not thread-safe.
 class TrailFinder {

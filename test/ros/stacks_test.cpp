@@ -8,6 +8,7 @@
 #include <std_srvs/Trigger.h>
 #include <tf2_ros/static_transform_broadcaster.h>
 
+#include <algorithm>
 #include <cmath>
 #include <string>
 #include <vector>
@@ -175,6 +176,52 @@ TEST_F(Stacks, LioSamGetsItsStampsAndItsJumpsAreFollowed) {
   ASSERT_TRUE(ros::service::call("/lio/trigger", trigger));
   EXPECT_FALSE(trigger.response.success);
   EXPECT_NE(trigger.response.message.find("no segments have come"), std::string::npos) << trigger.response.message;
+}
+
+TEST_F(Stacks, CorrectedOdometryMovesTheMap) {
+  Connect("/slam", "/slam/points");
+  ros::Publisher odometry = nh_.advertise<nav_msgs::Odometry>("/slam/odom", 10);
+  ros::Publisher corrected = nh_.advertise<nav_msgs::Odometry>("/slam/corrected", 10);
+  ASSERT_TRUE(WaitFor([&] { return odometry.getNumSubscribers() > 0 && corrected.getNumSubscribers() > 0; }));
+  const auto publish = [this](const ros::Publisher& publisher, int scan, const std::string& frame, const Pose& T) {
+    nav_msgs::Odometry message;
+    message.header.stamp = ToTime(drive_.stamp_ns(scan));
+    message.header.frame_id = frame;
+    message.child_frame_id = "slam_velodyne";
+    message.pose.pose = ToPoseMsg(T);
+    publisher.publish(message);
+  };
+  // A SLAM that is always right, in a map that is turned against odom.
+  const Pose T_map_world = Eigen::Translation3d(100.0, -50.0, 0.0) *
+                           Eigen::AngleAxisd(1.0, Eigen::Vector3d::UnitZ()) * drive_.T_world_sensor(0).inverse();
+  for (int scan = 0; scan < drive_.scans(); ++scan) {
+    clouds_.publish(drive_.Cloud(scan, "slam_velodyne"));
+    publish(odometry, scan, "odom", drive_.T_odom_sensor(scan));
+    ASSERT_TRUE(IsAnswered(static_cast<std::size_t>(scan + 1))) << "no answer to scan " << scan;
+    publish(corrected, scan, "map", T_map_world * drive_.T_world_sensor(scan));
+  }
+  // The segments of the first lap lie where they truly are, which odometry has lost by metres when it sees them again.
+  ASSERT_GE(received_.size(), 10u);
+  std::vector<double> errors_m, drifts_m;
+  for (const LoopClosure& closure : received_) {
+    EXPECT_LT(Error_m(closure), 0.5);
+    const int query = ScanAt(closure.stamp_query), target = ScanAt(closure.stamp_target);
+    const Pose T_map_odom = T_map_world * drive_.T_world_sensor(query) * drive_.T_odom_sensor(query).inverse();
+    for (const MatchedSegments& match : closure.matches) {
+      const Eigen::Vector3d seen_map = T_map_odom * ToVector(match.centroid_query);
+      errors_m.push_back((ToVector(match.centroid_target) - seen_map).norm());
+    }
+    const Pose T_query_target = drive_.T_world_sensor(query).inverse() * drive_.T_world_sensor(target);
+    drifts_m.push_back((drive_.T_odom_sensor(query) * T_query_target.translation() -
+                        drive_.T_odom_sensor(target).translation())
+                           .norm());
+  }
+  const auto median = [](std::vector<double> values) {
+    std::sort(values.begin(), values.end());
+    return values[values.size() / 2];
+  };
+  EXPECT_GT(median(drifts_m), 2.0);
+  EXPECT_LT(median(errors_m), 0.3);
 }
 
 }  // namespace
