@@ -151,7 +151,8 @@ void FrontEndNodelet::OnPose(const geometry_msgs::PoseStampedConstPtr& pose) {
 }
 
 void FrontEndNodelet::OnTrajectory(const nav_msgs::PathConstPtr& path) {
-  worker_->PostAlways([this, path] { FollowJump(*path); });
+  const std::lock_guard<std::mutex> lock(mutex_);
+  trajectory_ = path;
 }
 
 bool FrontEndNodelet::OnRequestFullState(RequestFullState::Request& /*request*/, RequestFullState::Response& response) {
@@ -177,6 +178,7 @@ void FrontEndNodelet::ProcessCloud(const sensor_msgs::PointCloud2& cloud, Clock:
   scan.stamp_ns = ToStampNs(cloud.header.stamp);
   scan.T_odom_sensor = location->T_odom_sensor;
   try {
+    if (parameters_.frame_jumps) FollowTrajectory(cloud.header.stamp, received);
     scan.points_sensor = ReadScanPoints(cloud, *location);
     if (!HasFinitePoint(scan.points_sensor))
       return Skip("no finite point",
@@ -249,14 +251,34 @@ Points FrontEndNodelet::ReadScanPoints(const sensor_msgs::PointCloud2& cloud, co
                                 : ReadPoints(cloud);
 }
 
+/// Follows the newest trajectory; waits a little for one that is no older than the cloud.
+void FrontEndNodelet::FollowTrajectory(const ros::Time& stamp, Clock::time_point received) {
+  const auto deadline = received + std::chrono::duration<double>(parameters_.trajectory_wait_s);
+  const auto has_come = [this, &stamp] {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    return trajectory_ && trajectory_->header.stamp >= stamp;
+  };
+  while (!has_come() && Clock::now() < deadline && !worker_->stopping()) worker_->SleepFor(kPollPeriod_s);
+  nav_msgs::PathConstPtr path;
+  {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    path.swap(trajectory_);
+  }
+  if (path) FollowJump(*path);
+}
+
+/// The newest pose of the trajectory that was used for a cloud tells whether the frame has jumped since.
 void FrontEndNodelet::FollowJump(const nav_msgs::Path& path) {
-  const std::vector<StampedPose> trajectory = ToTrajectory(path, parameters_.trajectory_kind, frames_);
-  for (auto corrected = trajectory.rbegin(); corrected != trajectory.rend(); ++corrected) {
-    const auto used = std::find_if(history_.rbegin(), history_.rend(), [&corrected](const StampedPose& pose) {
-      return std::abs(pose.stamp_ns - corrected->stamp_ns) < kSameStampNs;
+  for (auto corrected = path.poses.rbegin(); corrected != path.poses.rend(); ++corrected) {
+    const StampNs stamp_ns = ToStampNs(corrected->header.stamp);
+    const auto used = std::find_if(history_.rbegin(), history_.rend(), [stamp_ns](const StampedPose& pose) {
+      return std::abs(pose.stamp_ns - stamp_ns) < kSameStampNs;
     });
     if (used == history_.rend()) continue;
-    const Pose T_new_old = corrected->T_frame_sensor * used->T_frame_sensor.inverse();
+    const Pose T_base_sensor =
+        parameters_.trajectory_kind == FrameKind::kBase ? frames_.T_base_sensor : Pose::Identity();
+    const Pose T_frame_sensor = ToPose(corrected->pose, "trajectory") * T_base_sensor;
+    const Pose T_new_old = T_frame_sensor * used->T_frame_sensor.inverse();
     if (T_new_old.isApprox(Pose::Identity(), 1e-6)) return;
     front_end_->ApplyJump(T_new_old);
     for (StampedPose& pose : history_) pose.T_frame_sensor = T_new_old * pose.T_frame_sensor;

@@ -81,6 +81,7 @@ class FrontEndNodelet : public nodelet::Nodelet {
   bool AcceptStamp(const sensor_msgs::PointCloud2& cloud);
   std::optional<SensorLocation> WaitForLocation(const sensor_msgs::PointCloud2& cloud, Clock::time_point received);
   Points ReadScanPoints(const sensor_msgs::PointCloud2& cloud, const SensorLocation& location) const;
+  void FollowTrajectory(const ros::Time& stamp, Clock::time_point received);
   void FollowJump(const nav_msgs::Path& path);
   void Restart();
   void Skip(const std::string& kind, const std::string& reason);
@@ -108,6 +109,7 @@ class FrontEndNodelet : public nodelet::Nodelet {
 
   std::mutex mutex_;
   Status status_;
+  nav_msgs::PathConstPtr trajectory_;  // the newest that was not followed yet; guarded by mutex_
 
   // Owned by the worker's thread.
   std::unique_ptr<FrontEnd> front_end_;

@@ -175,6 +175,7 @@ NodeletParameters<FrontEndNodeParameters> ReadFrontEndParameters(const ros::Node
   reader.Read("odometry_max_gap_s", node.odometry_max_gap_s);
   reader.Read("frame_jumps", node.frame_jumps);
   reader.Read("trajectory_kind", node.trajectory_kind, kFrameKinds);
+  reader.Read("trajectory_wait_s", node.trajectory_wait_s);
   reader.Read("queue_size", node.queue_size);
   reader.Read("send_points", node.send_points);
   parameters.core = ReadCore(reader, "front_end");
@@ -236,6 +237,7 @@ void Validate(const FrontEndNodeParameters& node, const std::string& path) {
           "must be set where clouds are registered: their frame_id does not tell it");
   require(node.pose_timeout_s >= 0.0, "pose_timeout_s", "must not be negative");
   require(node.odometry_max_gap_s > 0.0, "odometry_max_gap_s", "must be positive");
+  require(node.trajectory_wait_s >= 0.0, "trajectory_wait_s", "must not be negative");
   require(node.queue_size > 0, "queue_size", "must be at least 1");
 }
 

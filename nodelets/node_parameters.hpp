@@ -34,6 +34,8 @@ struct FrontEndNodeParameters {
   double odometry_max_gap_s = 0.5;       ///< longest time between two poses of a topic over which is interpolated
   bool frame_jumps = false;              ///< odom_frame jumps at corrections: follow the topic `trajectory`
   FrameKind trajectory_kind = FrameKind::kBase;  ///< whose poses `trajectory` holds: `base` or `sensor`
+  double trajectory_wait_s = 0.0;                ///< with frame_jumps: how long a cloud waits for a trajectory stamped no
+                                                 ///< earlier, which may tell of a jump; 0: it has come before
   int queue_size = 5;                            ///< clouds; when full, the oldest goes
   bool send_points = true;                       ///< the thinned scan, for refinement, and of new views those that are shown
 };

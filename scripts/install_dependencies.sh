@@ -11,7 +11,7 @@ something is missing. Recommended packages are not installed.
 
   --benchmark  also for the benchmarks (google-benchmark)
   --docs       also for the target `docs` (Doxygen)
-  --pictures   also for pictures of rviz without a display (Xvfb, ImageMagick)
+  --pictures   also for pictures of rviz without a display (ImageMagick)
   --tools      also clang-format and clang-tidy
   --all        all of these
   --list       print the names of the packages, and install nothing
@@ -40,6 +40,7 @@ fi
 packages=(
   build-essential cmake pkg-config python3
   libceres-dev libcli11-dev libeigen3-dev libflann-dev libgtest-dev libpcl-dev libyaml-cpp-dev nlohmann-json3-dev
+  libgl1-mesa-dri xvfb  # a test starts rviz
 )
 case "$system" in
   debian-12)
@@ -53,7 +54,7 @@ case "$system" in
       libsensor-msgs-dev libstd-msgs-dev libstd-srvs-dev libtf2-dev libtf2-eigen-dev libtf2-msgs-dev libtf2-ros-dev
       libtopic-tools-dev libvisualization-msgs-dev pluginlib-dev
       libnodeletlib-tools python3-dynamic-reconfigure python3-rosbag python3-roslaunch python3-rosnode
-      python3-rosparam python3-rosservice python3-rostest python3-rostopic rosout rospack-tools rviz
+      python3-rosparam python3-rosservice python3-rospy python3-rostest python3-rostopic python3-std-srvs rosout rospack-tools rviz
     )
     ;;
   ubuntu-20.04)
@@ -80,7 +81,7 @@ MESSAGE
 esac
 if $benchmark; then packages+=(libbenchmark-dev); fi
 if $docs; then packages+=(doxygen graphviz); fi
-if $pictures; then packages+=(imagemagick libgl1-mesa-dri xvfb); fi
+if $pictures; then packages+=(imagemagick); fi
 if $tools; then packages+=(clang-format clang-tidy); fi
 
 if $list; then
