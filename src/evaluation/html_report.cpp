@@ -455,8 +455,8 @@ std::string TruePairs(const EvaluationResult& result) {
     return Tagged(std::string("/true_pairs/centroid_difference_m/") + which, value, "%.2f") + " m";
   };
   table.push_back({"centroids differ by, median and 90 %", metres("median", statistics.centroid_difference_median_m) +
-                                                                ", " +
-                                                                metres("p90", statistics.centroid_difference_90_m)});
+                                                               ", " +
+                                                               metres("p90", statistics.centroid_difference_90_m)});
   table.push_back({"voxels of the smaller over the larger, median, and a tenth is below",
                    Tagged("/true_pairs/size_ratio/median", statistics.size_ratio_median, "%.2f") + ", " +
                        Tagged("/true_pairs/size_ratio/p10", statistics.size_ratio_10, "%.2f")});

@@ -16,9 +16,8 @@ using Json = nlohmann::ordered_json;
 constexpr double kDegPerRad = 180.0 / M_PI;
 
 std::size_t StepAt(const EvaluationResult& result, StampNs stamp_ns) {
-  const auto it =
-      std::lower_bound(result.odometry.begin(), result.odometry.end(), stamp_ns,
-                       [](const StampedPose& pose, StampNs stamp) { return pose.stamp_ns < stamp; });
+  const auto it = std::lower_bound(result.odometry.begin(), result.odometry.end(), stamp_ns,
+                                   [](const StampedPose& pose, StampNs stamp) { return pose.stamp_ns < stamp; });
   if (it == result.odometry.end() || it->stamp_ns != stamp_ns)
     throw std::invalid_argument("a closure's stamp is no scan's");
   return static_cast<std::size_t>(it - result.odometry.begin());

@@ -1,5 +1,6 @@
 /// \file
-/// Whether a robot that was carried elsewhere recognises what it would have recognised (METHOD 5: no prior on the pose).
+/// Whether a robot that was carried elsewhere recognises what it would have recognised (METHOD 5: no prior on the
+/// pose).
 #pragma once
 
 #include <cstddef>
@@ -32,9 +33,9 @@ struct KidnapComparison {
 };
 
 /// Compares two runs without optimization over the same scans; from step `first_moved` on the odometry of `carried` is
-/// moved by a rigid transform. Where the targets of a step differ, they are joined by the undisturbed odometry. `refill_m`
-/// of path behind that step are told apart: the local map begins anew there. Throws std::invalid_argument if the runs
-/// differ in their stamps or have no score.
+/// moved by a rigid transform. Where the targets of a step differ, they are joined by the undisturbed odometry.
+/// `refill_m` of path behind that step are told apart: the local map begins anew there. Throws std::invalid_argument if
+/// the runs differ in their stamps or have no score.
 KidnapComparison CompareKidnapped(const std::string& drive, const EvaluationResult& undisturbed,
                                   const EvaluationResult& carried, std::size_t first_moved, double refill_m);
 

@@ -198,15 +198,14 @@ std::string FormatTruePairs(const TruePairStatistics& statistics) {
                             statistics.pairs, statistics.steps) +
                      Number(statistics.rank_median, "%.0f") + " in the median, 90 % " +
                      Number(statistics.rank_90, "%.0f") + "\n  target among first";
-  for (const auto& [rank, share] : statistics.share_within_rank)
-    text += Format(" %zu: ", rank) + Number(share, "%.3f");
+  for (const auto& [rank, share] : statistics.share_within_rank) text += Format(" %zu: ", rank) + Number(share, "%.3f");
   text += "\n  kept              allowed " + Number(statistics.kept_allowed, "%.3f") + ", nearest " +
           Number(statistics.kept_nearest, "%.3f") + ", max_distance " + Number(statistics.kept_within, "%.3f") +
           ", consistent " + Number(statistics.kept_consistent, "%.3f");
   text += "\n  centroids differ  by " + Number(statistics.centroid_difference_median_m, "%.2f m") +
           " in the median, 90 % " + Number(statistics.centroid_difference_90_m, "%.2f m") + "; size ratio " +
-          Number(statistics.size_ratio_median, "%.2f") + ", a tenth below " +
-          Number(statistics.size_ratio_10, "%.2f") + "\n";
+          Number(statistics.size_ratio_median, "%.2f") + ", a tenth below " + Number(statistics.size_ratio_10, "%.2f") +
+          "\n";
   return text;
 }
 
@@ -296,8 +295,8 @@ std::string FormatSummary(const EvaluationResult& result) {
   if (!comparison.empty())
     text += Format("\n%-34s %9s %9s %9s %9s\n", "medians, ms", "steps", "ours", "batch", "ratio");
   for (const StageComparison& stage : comparison) {
-    text += Format("%-34s %9zu %9.3f %9.3f %9s\n", stage.stage.c_str(), stage.steps, stage.incremental_ms, stage.batch_ms,
-                   Number(stage.ratio(), "%.1f").c_str());
+    text += Format("%-34s %9zu %9.3f %9.3f %9s\n", stage.stage.c_str(), stage.steps, stage.incremental_ms,
+                   stage.batch_ms, Number(stage.ratio(), "%.1f").c_str());
   }
   return text;
 }

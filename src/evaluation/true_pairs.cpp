@@ -17,8 +17,8 @@ std::size_t IndexOf(const TrueTrajectory& truth, StampNs stamp_ns) {
 std::vector<double> PathOf(const TrueTrajectory& truth) {
   std::vector<double> path_m(truth.T_world_sensor.size(), 0.0);
   for (std::size_t i = 1; i < path_m.size(); ++i) {
-    path_m[i] = path_m[i - 1] +
-                (truth.T_world_sensor[i].translation() - truth.T_world_sensor[i - 1].translation()).norm();
+    path_m[i] =
+        path_m[i - 1] + (truth.T_world_sensor[i].translation() - truth.T_world_sensor[i - 1].translation()).norm();
   }
   return path_m;
 }
@@ -35,8 +35,8 @@ struct Ranked {
   double distance;   // scaled
 };
 
-// Of a segment among all that are open to the robot, in the order of TargetIndex::Nearest; nothing if it is not open. All
-// views are gone through: sorting them all for each query would be the larger part of a run.
+// Of a segment among all that are open to the robot, in the order of TargetIndex::Nearest; nothing if it is not open.
+// All views are gone through: sorting them all for each query would be the larger part of a run.
 std::optional<Ranked> RankOf(const SegmentKey& segment, const Descriptor& query, RobotIndex robot,
                              const TargetIndex& index) {
   std::vector<std::pair<float, SegmentKey>> views;

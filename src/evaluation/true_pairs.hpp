@@ -1,6 +1,6 @@
 /// \file
-/// What happens to pairs of segments that are one object seen twice: how far up the true target is among the candidates,
-/// and which stage loses it. Needs ground truth, and is used for nothing but figures.
+/// What happens to pairs of segments that are one object seen twice: how far up the true target is among the
+/// candidates, and which stage loses it. Needs ground truth, and is used for nothing but figures.
 #pragma once
 
 #include <cstddef>
@@ -21,9 +21,9 @@ struct TruePair {
   double centroid_difference_m = 0.0;  ///< of the two centroids, each placed by the true pose of its scan
   double size_ratio = 0.0;             ///< voxels of the smaller over voxels of the larger one
   bool allowed = false;                ///< the target was open to matching
-  std::size_t rank = 0;   ///< of the target among all open ones by descriptor distance, from 1; 0 if it is not allowed
-  bool nearest = false;   ///< allowed, and among the `nearest` that are taken
-  bool within = false;    ///< nearest, and within `max_distance`
+  std::size_t rank = 0;  ///< of the target among all open ones by descriptor distance, from 1; 0 if it is not allowed
+  bool nearest = false;  ///< allowed, and among the `nearest` that are taken
+  bool within = false;   ///< nearest, and within `max_distance`
   bool consistent = false;  ///< in the set of the step's recognition, accepted or refused
 };
 

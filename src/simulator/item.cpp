@@ -368,19 +368,21 @@ Primitives BuildDesk(const Item& item) {
   const float height = static_cast<float>(item.height_m);
   Primitives out{Primitive::Box({0, 0, height}, {half.x(), half.y(), 0.02f}, Material::kWood)};
   for (const float side : {-1.f, 1.f}) {
-    out.push_back(Primitive::Box({0, side * (half.y() - 0.03f), 0.5f * height}, {half.x() - 0.05f, 0.02f, 0.5f * height},
-                                 Material::kWood));
+    out.push_back(Primitive::Box({0, side * (half.y() - 0.03f), 0.5f * height},
+                                 {half.x() - 0.05f, 0.02f, 0.5f * height}, Material::kWood));
   }
   if (random.Chance(0.6)) {
     const float side = random.Chance(0.5) ? 1.f : -1.f;
-    out.push_back(Primitive::Box({0, side * (half.y() - 0.28f), 0.3f}, {half.x() - 0.08f, 0.2f, 0.29f}, Material::kMetal));
+    out.push_back(
+        Primitive::Box({0, side * (half.y() - 0.28f), 0.3f}, {half.x() - 0.08f, 0.2f, 0.29f}, Material::kMetal));
   }
   if (random.Chance(0.4))
-    out.push_back(Primitive::Box({0.05f - half.x(), 0, 0.5f * height}, {0.02f, half.y(), 0.35f * height}, Material::kWood));
+    out.push_back(
+        Primitive::Box({0.05f - half.x(), 0, 0.5f * height}, {0.02f, half.y(), 0.35f * height}, Material::kWood));
   for (int screens = random.Index(3), i = 0; i < screens; ++i) {
-    out.push_back(Primitive::Box({-0.6f * half.x(), (static_cast<float>(i) - 0.5f * static_cast<float>(screens - 1)) * 0.6f,
-                                  height + 0.28f},
-                                 {0.03f, 0.27f, 0.2f}, Material::kMetal));
+    out.push_back(Primitive::Box(
+        {-0.6f * half.x(), (static_cast<float>(i) - 0.5f * static_cast<float>(screens - 1)) * 0.6f, height + 0.28f},
+        {0.03f, 0.27f, 0.2f}, Material::kMetal));
   }
   return out;
 }
@@ -401,7 +403,8 @@ Primitives BuildPottedPlant(const Item& item) {
 
 Primitives BuildCeiling(const Item& item) {
   const Vector2f half = item.footprint.half_m.cast<float>();
-  return {Primitive::Box({0, 0, static_cast<float>(item.height_m) + 0.1f}, {half.x(), half.y(), 0.1f}, Material::kPlaster)};
+  return {
+      Primitive::Box({0, 0, static_cast<float>(item.height_m) + 0.1f}, {half.x(), half.y(), 0.1f}, Material::kPlaster)};
 }
 
 // Looks towards +x.

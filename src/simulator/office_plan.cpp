@@ -113,8 +113,8 @@ class OfficePlanner {
         } else if (pick < 0.84) {
           Plant(place);
         } else if (pick < 0.92) {
-          Put(ItemKind::kPartition,
-              {place, random_.Index(2) * kPi / 2, {kHalfWall_m, random_.Uniform(0.7, 1.3)}}, random_.Uniform(1.2, 1.7));
+          Put(ItemKind::kPartition, {place, random_.Index(2) * kPi / 2, {kHalfWall_m, random_.Uniform(0.7, 1.3)}},
+              random_.Uniform(1.2, 1.7));
         }
       }
     }

@@ -15,7 +15,7 @@ constexpr double kLaneOffset_m = 1.75;   // the vehicle keeps to the right of th
 constexpr double kCornerRadius_m = 9.0;  // of the road's axis
 constexpr double kIndoorCornerRadius_m = 0.7;
 constexpr double kIndoorSpeed_m_s = 1.0;
-constexpr double kStep_m = 0.25;         // sampling of the path before it is driven
+constexpr double kStep_m = 0.25;  // sampling of the path before it is driven
 constexpr double kLateralLimit_m_s2 = 2.0;
 constexpr double kBrakeLimit_m_s2 = 1.5;
 
@@ -40,8 +40,8 @@ struct Lane {
 constexpr Lane kRoad{kLaneOffset_m, kCornerRadius_m};
 constexpr Lane kCorridor{0.0, kIndoorCornerRadius_m};
 
-// The arc of the driven lane around a corner of the axis: tangent to both legs at the corner's radius from the axis's arc
-// centre.
+// The arc of the driven lane around a corner of the axis: tangent to both legs at the corner's radius from the axis's
+// arc centre.
 void AppendCorner(Path& path, const Lane& lane, const Eigen::Vector2d& corner, const Eigen::Vector2d& in,
                   const Eigen::Vector2d& out) {
   const double turn = std::atan2(Cross(in, out), in.dot(out));

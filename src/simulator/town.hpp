@@ -24,10 +24,10 @@ enum class World {
 
 struct TownParameters {
   World world = World::kTown;
-  std::uint64_t seed = 1;            ///< of everything that stands still
-  std::uint64_t day = 0;             ///< another day: other parked cars and traffic in the same town
-  double grade = 0.04;               ///< steepest slope of the ground
-  double parked_change = 0.4;        ///< chance that a parked car or a chair changes between two visits more than 60 s apart
+  std::uint64_t seed = 1;      ///< of everything that stands still
+  std::uint64_t day = 0;       ///< another day: other parked cars and traffic in the same town
+  double grade = 0.04;         ///< steepest slope of the ground
+  double parked_change = 0.4;  ///< chance that a parked car or a chair changes between two visits more than 60 s apart
   double meetings_per_minute = 6.0;  ///< with oncoming vehicles
   double pedestrians_per_100m = 2.0;
 };

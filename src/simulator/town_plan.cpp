@@ -357,8 +357,8 @@ class Planner {
     }
   }
 
-  // Everything that is built or planted is equal, at equal distances: the seed of each kind is one and the same. Parking
-  // spots lie at equal distances too; which cars stand there is chance, as in reality.
+  // Everything that is built or planted is equal, at equal distances: the seed of each kind is one and the same.
+  // Parking spots lie at equal distances too; which cars stand there is chance, as in reality.
   void LookAlikeSide(const StreetSide& side) {
     const auto add = [&](ItemKind kind, const Footprint& footprint, double height, double margin, std::uint64_t make) {
       plot_.Add({kind, footprint, height, HashOf(parameters_.seed, make), LowestLeaf(footprint)}, margin);

@@ -231,11 +231,10 @@ TEST_F(Drive, MatrixGathersRuns) {
 TEST(Presets, FindSegmentsWithTheirSensors) {
   const test::TemporaryDirectory directory;
   const std::string street = "--route lap --first-frame 100 --stride 2 ", office = "--route office --stride 5 ";
-  for (const auto& [preset, drive] : {std::make_pair("hdl64e", street + "--sensor HDL-64E"),
-                                      std::make_pair("hdl32e", street + "--sensor HDL-32E"),
-                                      std::make_pair("vlp16", street + "--sensor VLP-16"),
-                                      std::make_pair("os1_128", street + "--sensor OS1-128"),
-                                      std::make_pair("indoor", office + "--sensor VLP-16 --sensor-height 0.6")}) {
+  for (const auto& [preset, drive] :
+       {std::make_pair("hdl64e", street + "--sensor HDL-64E"), std::make_pair("hdl32e", street + "--sensor HDL-32E"),
+        std::make_pair("vlp16", street + "--sensor VLP-16"), std::make_pair("os1_128", street + "--sensor OS1-128"),
+        std::make_pair("indoor", office + "--sensor VLP-16 --sensor-height 0.6")}) {
     SCOPED_TRACE(preset);
     const Outcome run = Segmatch(std::string("evaluate --simulate --max-steps 12 ") + drive + " --config " +
                                  SEGMATCH_SOURCE_DIR "/config/" + preset + ".yaml --out " + directory.path());
@@ -247,7 +246,8 @@ TEST(Presets, FindSegmentsWithTheirSensors) {
 
 TEST(Experiment, KidnappedBesideUndisturbed) {
   const test::TemporaryDirectory directory;
-  const Outcome run = Segmatch("experiment kidnap --drives lap:0:4 --seeds 2 --sensor VLP-16 --out " + directory.path());
+  const Outcome run =
+      Segmatch("experiment kidnap --drives lap:0:4 --seeds 2 --sensor VLP-16 --out " + directory.path());
   ASSERT_EQ(run.status, 0) << run.output;
   EXPECT_HAS(run.output, "| lap_0_4, seed 2 | before | 2 |");
   EXPECT_TRUE(std::filesystem::exists(directory.path() + "/lap_0_4_seed2_carried/report.html"));

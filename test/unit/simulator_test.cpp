@@ -177,7 +177,8 @@ TEST(SimulationTest, TheOfficeHasFurnitureAndItsChairsAreMoved) {
     for (std::size_t k = 1; k < visits.size(); ++k) {
       if (visits[k].begin_s - visits[k - 1].end_s < 60.0) continue;
       ++seen_again;
-      const Footprint before = town.StandsOn(i, visits[k - 1].end_s)->footprint, after = town.StandsOn(i, visits[k].begin_s)->footprint;
+      const Footprint before = town.StandsOn(i, visits[k - 1].end_s)->footprint,
+                      after = town.StandsOn(i, visits[k].begin_s)->footprint;
       moved += before.centre_m != after.centre_m;
     }
   }
