@@ -54,7 +54,9 @@ case "$system" in
       libsensor-msgs-dev libstd-msgs-dev libstd-srvs-dev libtf2-dev libtf2-eigen-dev libtf2-msgs-dev libtf2-ros-dev
       libtopic-tools-dev libvisualization-msgs-dev pluginlib-dev
       libnodeletlib-tools python3-dynamic-reconfigure python3-rosbag python3-roslaunch python3-rosnode
-      python3-rosparam python3-rosservice python3-rospy python3-rostest python3-rostopic python3-std-srvs rosout rospack-tools rviz
+      python3-rosparam python3-rosservice python3-rospy python3-rostest python3-rostopic rosout rospack-tools rviz
+      # for rostopic echo and rosservice call
+      python3-diagnostic-msgs python3-geometry-msgs python3-nav-msgs python3-std-srvs
     )
     ;;
   ubuntu-20.04)
