@@ -92,13 +92,23 @@ void WriteStepsCsv(const EvaluationResult& result, const std::string& path) {
 void WriteMissedCsv(const EvaluationResult& result, const std::string& path) {
   std::ofstream file(path);
   if (!file) throw std::runtime_error("can't write " + path);
-  file << "step,stamp,direction,since_m,nearest_old_step,cause,segments,candidates,edges,clique,clique_needed\n";
+  file << "step,stamp,direction,since_m,nearest_old_step,cause,segments,candidates,edges,clique,clique_needed,"
+          "seen_before,open,candidates_true\n";
   for (const MissedRevisit& miss : FindMissedRevisits(result)) {
     const StepRecord& step = result.steps[miss.step];
     file << miss.step << ',' << FormatSeconds(step.stamp_ns) << ',' << (miss.opposite ? "opposite" : "same") << ','
          << miss.since_m << ',' << miss.target_step << ',' << miss.cause << ',' << step.front_end.clusters.segments
          << ',' << step.back_end.candidates << ',' << step.back_end.edges << ',' << step.back_end.clique << ','
-         << result.min_clique << '\n';
+         << result.min_clique;
+    // How many of the local segments were seen before, and which stage lost them.
+    std::size_t seen_before = 0, open = 0, candidates = 0;
+    for (const TruePair& pair : result.true_pairs) {
+      if (pair.step != miss.step) continue;
+      ++seen_before;
+      open += pair.allowed;
+      candidates += pair.within;
+    }
+    file << ',' << seen_before << ',' << open << ',' << candidates << '\n';
   }
   file.close();
   if (!file) throw std::runtime_error("writing " + path + " failed: is the disk full?");
