@@ -125,7 +125,7 @@ BackEnd::BackEnd(const BackEndParameters& parameters, TargetMap map, RecognizeFu
     robots_.back().name = map_.RobotName(robot);
   }
   loaded_robots_ = static_cast<RobotIndex>(robots_.size());
-  for (const auto& [key, segment] : map_.segments()) index_.Add(key, map_, true);
+  for (const auto& [key, segment] : map_.segments()) index_.Open(key, map_, segment.views.size(), true);
 }
 
 BackEndStep BackEnd::Process(const SegmentDelta& delta) {
@@ -236,7 +236,7 @@ RobotIndex BackEnd::RobotByName(const std::string& name) {
   while (map_.RobotByName(name_in_map) != robot) name_in_map += "'";
   // From the second robot on, what is being tracked is open to the others.
   for (const auto& [key, segment] : map_.segments())
-    if (!index_.Contains(key)) index_.Add(key, map_, false);
+    index_.Open(key, map_, segment.tracked ? 0 : CountReleased(segment), true);
   return robot;
 }
 
@@ -275,14 +275,14 @@ void BackEnd::RetireSegment(RobotIndex robot, const RetiredSegment& retired) {
   if (!IsLoopClosure()) return;
 
   SegmentKey key{robot, retired.id};
-  index_.Remove(key);
+  index_.Close(key);
   if (retired.cause == RetirementCause::kTooLarge || retired.cause == RetirementCause::kTrail) {
     map_.Erase(key);
     return;
   }
   if (segment.same_as && map_.Find(*segment.same_as) != nullptr) {
     // The same object, seen on another visit: one target segment with the views of both.
-    index_.Remove(*segment.same_as);
+    index_.Close(*segment.same_as);
     map_.MoveViews(key, *segment.same_as);
     key = *segment.same_as;
   }
@@ -290,8 +290,7 @@ void BackEnd::RetireSegment(RobotIndex robot, const RetiredSegment& retired) {
   if (target == nullptr) return;
   target->tracked = false;
   target->last_seen_ns = std::max(target->last_seen_ns, segment.last_seen_ns);
-  waiting_.emplace(target->last_seen_ns, Waiting{key, segment.last_seen_path_m});
-  if (robots_.size() > 1) index_.Add(key, map_, false);
+  AwaitRelease(key);
 }
 
 void BackEnd::RenameSegment(RobotIndex robot, const RenamedSegment& renamed) {
@@ -303,7 +302,7 @@ void BackEnd::RenameSegment(RobotIndex robot, const RenamedSegment& renamed) {
   const auto to = local.find(renamed.to);
   if (to != local.end() && !to->second.same_as) to->second.same_as = absorbed.same_as;
   if (!IsLoopClosure()) return;
-  index_.Remove({robot, renamed.from});
+  index_.Close({robot, renamed.from});
   map_.MoveViews({robot, renamed.from}, {robot, renamed.to});
 }
 
@@ -313,7 +312,6 @@ void BackEnd::UpdateSegment(RobotIndex robot_index, const SegmentState& state, c
   segment.centroid_odom = state.centroid_odom;
   segment.descriptor = state.descriptor;
   segment.last_seen_ns = delta.stamp_ns;
-  segment.last_seen_path_m = robot.path_m;
   if (!IsLoopClosure() || !state.new_view) return;
   const SegmentKey key{robot_index, state.id};
   SegmentView view;
@@ -325,26 +323,44 @@ void BackEnd::UpdateSegment(RobotIndex robot_index, const SegmentState& state, c
   view.points_centroid = state.points_centroid;
   map_.UpdateSegment(key, std::move(view), true, delta.stamp_ns);
   map_.Find(key)->tracked = true;
-  if (robots_.size() > 1) index_.Add(key, map_, false);
+  if (robots_.size() > 1) {
+    index_.Close(key);
+    index_.Open(key, map_, 0, true);
+  }
 }
 
-/// Opens segments to their own robot once they were last seen longer ago than the time window, in time and in path.
+/// The views of a segment that is no longer tracked wait, each for itself, until they are old enough to be targets of their
+/// own robot: what is seen until late may have been seen long ago as well.
+void BackEnd::AwaitRelease(const SegmentKey& key) {
+  const TargetSegment& target = *map_.Find(key);
+  for (const SegmentView& view : target.views) waiting_.emplace(map_.PoseOf(view).stamp_ns, key);
+  if (robots_.size() > 1) index_.Open(key, map_, 0, true);
+}
+
+/// Opens views to their own robot once they were taken longer ago than the time window, in time and in path.
 void BackEnd::ReleaseTargets(StampNs now_ns) {
   const StampNs window_ns = static_cast<StampNs>(parameters_.matching.time_window_s * 1e9);
   for (auto it = waiting_.begin(); it != waiting_.end() && now_ns - it->first > window_ns;) {
-    const auto& [last_seen_ns, waiting] = *it;
-    const TargetSegment* target = map_.Find(waiting.segment);
-    const bool current = target != nullptr && target->last_seen_ns == last_seen_ns;  // neither gone nor seen again since
-    if (current) {
-      const Robot& robot = robots_[target->views.back().robot];
-      if (robot.path_m - waiting.last_seen_path_m <= parameters_.matching.min_path_m) {
-        ++it;
+    const SegmentKey key = it->second;
+    const TargetSegment* target = map_.Find(key);
+    if (target != nullptr && !target->tracked) {
+      const std::size_t released = CountReleased(*target);
+      if (released < target->views.size() && map_.PoseOf(target->views[released]).stamp_ns <= it->first) {
+        ++it;  // old in time, but not in path
         continue;
       }
-      index_.Add(waiting.segment, map_, true);
+      index_.Open(key, map_, released, robots_.size() > 1);
     }
     it = waiting_.erase(it);
   }
+}
+
+/// How many of a segment's views, the oldest ones, are old enough for the robots that took them; those of a loaded map are.
+std::size_t BackEnd::CountReleased(const TargetSegment& target) const {
+  const auto is_young = [&](const SegmentView& view) {
+    return view.robot >= loaded_robots_ && IsYoung(view.robot, view.pose);
+  };
+  return static_cast<std::size_t>(std::find_if(target.views.begin(), target.views.end(), is_young) - target.views.begin());
 }
 
 bool BackEnd::NeedsQuery(RobotIndex robot, const LocalSegment& segment) const {
@@ -429,7 +445,7 @@ const SegmentView& BackEnd::MatchedView(RobotIndex robot, const Correspondence& 
 std::optional<Closure> BackEnd::Verify(RobotIndex robot, StampNs stamp_ns, const RecognizerResult& result,
                                        BackEndCounts* counts) {
   const Recognition& recognition = *result.recognition;
-  const std::optional<KeyframeName> target = NearestKeyframe(robot, stamp_ns, recognition);
+  const std::optional<KeyframeName> target = NearestKeyframe(robot, recognition);
   if (!target) {
     counts->end = StepEnd::kTooYoung;
     return std::nullopt;
@@ -481,8 +497,7 @@ const TrajectoryPose& BackEnd::PoseOf(const KeyframeName& keyframe) const {
 
 /// Of the key frames along the passes on which the matched segments were seen the one nearest to the recognised place: other
 /// passes may lie where they don't belong, until a correction. None if all of them are too young.
-std::optional<BackEnd::KeyframeName> BackEnd::NearestKeyframe(RobotIndex robot, StampNs stamp_ns,
-                                                              const Recognition& recognition) const {
+std::optional<BackEnd::KeyframeName> BackEnd::NearestKeyframe(RobotIndex robot, const Recognition& recognition) const {
   std::map<RobotIndex, std::vector<double>> seen_from_m;  // path of the poses, by robot
   for (const Correspondence& inlier : recognition.inliers) {
     const SegmentView& view = MatchedView(robot, inlier);
@@ -500,7 +515,7 @@ std::optional<BackEnd::KeyframeName> BackEnd::NearestKeyframe(RobotIndex robot, 
       if (distance2 >= nearest2) continue;
       const auto next = std::lower_bound(paths_m.begin(), paths_m.end(), pose.path_m - parameters_.keyframes.reach_m);
       if (next == paths_m.end() || *next > pose.path_m + parameters_.keyframes.reach_m) continue;
-      if (other == robot && IsYoung(robot, stamp_ns, map_.Keyframes(other)[i].pose)) continue;
+      if (other == robot && IsYoung(robot, map_.Keyframes(other)[i].pose)) continue;
       nearest2 = distance2;
       nearest = keyframe;
     }
@@ -574,8 +589,8 @@ void BackEnd::KeepHistory(RobotIndex index) {
 }
 
 /// Whether a robot was at a pose of its trajectory too recently, in time or in path, for a closure.
-bool BackEnd::IsYoung(RobotIndex robot, StampNs now_ns, std::uint32_t pose) const {
-  const double age_s = static_cast<double>(now_ns - map_.Trajectory(robot)[pose].stamp_ns) / 1e9;
+bool BackEnd::IsYoung(RobotIndex robot, std::uint32_t pose) const {
+  const double age_s = static_cast<double>(robots_[robot].stamp_ns - map_.Trajectory(robot)[pose].stamp_ns) / 1e9;
   return age_s <= parameters_.matching.time_window_s ||
          robots_[robot].path_m - map_.Trajectory(robot)[pose].path_m <= parameters_.matching.min_path_m;
 }

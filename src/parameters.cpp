@@ -352,8 +352,8 @@ const std::vector<Parameter>& Table() {
       NUMBER(back_end.matching.max_distance, AtLeast(0),
              "and within this distance of scaled descriptors; 0: no limit; one of both limits is needed"),
       NUMBER(back_end.matching.time_window_s, AtLeast(0),
-             "a robot's own segments that it saw more recently are no targets (loop closure)"),
-      NUMBER(back_end.matching.min_path_m, AtLeast(0), "nor are those that it saw less than this much of path ago"),
+             "views of segments that a robot took more recently are no targets of its own (loop closure)"),
+      NUMBER(back_end.matching.min_path_m, AtLeast(0), "nor are those taken less than this much of path ago"),
       NUMBER(back_end.matching.requery_distance, AtLeast(0),
              "a segment is matched anew once its scaled descriptor moved so far"),
 

@@ -10,24 +10,37 @@
 
 namespace incremental_segmatch {
 
-void TargetIndex::Add(const SegmentKey& segment, const TargetMap& map, bool released) {
-  Remove(segment);
+void TargetIndex::Open(const SegmentKey& segment, const TargetMap& map, std::size_t released, bool others_too) {
   const TargetSegment* target = map.Find(segment);
   if (target == nullptr) throw std::invalid_argument("segment " + std::to_string(segment.id) + " is not in the map");
-  for (std::uint32_t i = 0; i < target->views.size(); ++i)
-    Insert({segment, i, target->views[i].descriptor, map.CentroidMap(target->views[i]), true, released});
-  if (index_->size() >= rescale_at_) Rescale();
+  const std::size_t open = others_too ? target->views.size() : std::min(released, target->views.size());
+  for (std::uint32_t view = 0; view < open; ++view) {
+    const bool is_released = view < released;
+    std::vector<std::uint64_t>& items = items_[segment];
+    const auto present =
+        std::find_if(items.begin(), items.end(), [&](std::uint64_t item) { return views_[item].view == view; });
+    if (present != items.end()) {
+      if (views_[*present].released == is_released) continue;
+      Erase(*present);  // what its own robot may see from now on is new to it
+      items.erase(present);
+    }
+    const SegmentView& taken = target->views[view];
+    Insert({segment, view, taken.robot, taken.descriptor, map.CentroidMap(taken), true, is_released});
+  }
+  if (index_ && index_->size() >= rescale_at_) Rescale();
 }
 
-void TargetIndex::Remove(const SegmentKey& segment) {
+void TargetIndex::Close(const SegmentKey& segment) {
   const auto found = items_.find(segment);
   if (found == items_.end()) return;
-  for (const std::uint64_t item : found->second) {
-    index_->Remove(item);
-    views_[item].live = false;
-    views_[item].descriptor = Descriptor();
-  }
+  for (const std::uint64_t item : found->second) Erase(item);
   items_.erase(found);
+}
+
+void TargetIndex::Erase(std::uint64_t item) {
+  index_->Remove(item);
+  views_[item].live = false;
+  views_[item].descriptor = Descriptor();
 }
 
 void TargetIndex::RefreshCentroids(const TargetMap& map) {

@@ -33,8 +33,8 @@ enum class Mode {
 struct MatchingParameters {
   int nearest = 25;               ///< candidates of a local segment: so many nearest; 0: no limit
   double max_distance = 0.0;      ///< and within this scaled descriptor distance; 0: no limit
-  double time_window_s = 60.0;    ///< own segments seen more recently are no targets (loop closure)
-  double min_path_m = 50.0;       ///< nor are those seen less than this much of path ago
+  double time_window_s = 60.0;    ///< own views that were taken more recently are no targets (loop closure)
+  double min_path_m = 50.0;       ///< nor are those taken less than this much of path ago
   double requery_distance = 0.2;  ///< a segment is matched anew once its scaled descriptor moved so far
 };
 
@@ -177,7 +177,6 @@ class BackEnd {
     Eigen::Vector3d centroid_odom = Eigen::Vector3d::Zero();
     Descriptor descriptor;
     StampNs last_seen_ns = 0;
-    double last_seen_path_m = 0.0;
     std::optional<SegmentKey> same_as;  // target segment that it was recognised as
     Descriptor queried;                                            // descriptor at the last query; empty: never
     std::uint64_t queried_generation = 0;
@@ -205,11 +204,6 @@ class BackEnd {
     std::deque<PastScan> history;
     std::map<SegmentId, LocalSegment> local;
   };
-  // A segment that is no longer tracked, and waits for the time window to pass.
-  struct Waiting {
-    SegmentKey segment;
-    double last_seen_path_m = 0.0;
-  };
 
   // A key frame of the map.
   struct KeyframeName {
@@ -230,7 +224,9 @@ class BackEnd {
   void RetireSegment(RobotIndex robot, const RetiredSegment& retired);
   void RenameSegment(RobotIndex robot, const RenamedSegment& renamed);
   void UpdateSegment(RobotIndex robot, const SegmentState& state, const SegmentDelta& delta);
+  void AwaitRelease(const SegmentKey& key);
   void ReleaseTargets(StampNs now_ns);
+  std::size_t CountReleased(const TargetSegment& target) const;
   bool MatchSegment(RobotIndex robot, LocalSegment* segment) const;
   bool NeedsQuery(RobotIndex robot, const LocalSegment& segment) const;
   std::map<RobotIndex, Correspondences> CollectCorrespondences(RobotIndex robot) const;
@@ -241,8 +237,8 @@ class BackEnd {
   std::optional<KeyframeName> NearestKeyframeAlong(const KeyframeName& around, double along_m, const Eigen::Vector3d& place) const;
   void MeasureContradiction(RobotIndex robot, const KeyframeName& target, const Closure& closure, Evidence* evidence) const;
   void KeepHistory(RobotIndex robot);
-  bool IsYoung(RobotIndex robot, StampNs now_ns, std::uint32_t pose) const;
-  std::optional<KeyframeName> NearestKeyframe(RobotIndex robot, StampNs stamp_ns, const Recognition& recognition) const;
+  bool IsYoung(RobotIndex robot, std::uint32_t pose) const;
+  std::optional<KeyframeName> NearestKeyframe(RobotIndex robot, const Recognition& recognition) const;
   bool Refine(RobotIndex robot, const KeyframeName& target, Closure* closure);
   Submap& SubmapAround(const KeyframeName& keyframe);
   std::vector<Eigen::Vector3d> JoinScans(const KeyframeName& center) const;
@@ -259,7 +255,7 @@ class BackEnd {
   std::map<std::pair<RobotIndex, RobotIndex>, Recognizer> recognizers_;  // by robot and frame of its targets
   std::vector<Robot> robots_;  // by RobotIndex; those of a loaded map come first
   RobotIndex loaded_robots_ = 0;
-  std::multimap<StampNs, Waiting> waiting_;  // by when they were last seen
+  std::multimap<StampNs, SegmentKey> waiting_;  // segments by when views of them were taken that are not released yet
   std::deque<Submap> submaps_;               // of the last refinements, newest first: the next one is near
 };
 

@@ -17,10 +17,11 @@ namespace incremental_segmatch {
 struct IndexedView {
   SegmentKey segment;                                      ///< whose view it is
   std::uint32_t view = 0;                                  ///< index among the segment's views
+  RobotIndex robot = 0;                                    ///< who took it
   Descriptor descriptor;                                   ///< unscaled
   Eigen::Vector3d centroid_map = Eigen::Vector3d::Zero();  ///< in the map (m), at the time of insertion
-  bool live = false;                                       ///< false once its segment was removed
-  bool released = false;                                   ///< open to its own robot as well, not only to others
+  bool live = false;                                       ///< false once its segment was closed
+  bool released = false;                                   ///< open to that robot as well, not only to others
 };
 
 /// A target segment that looks like a local one, by its most alike view.
@@ -34,17 +35,15 @@ struct TargetCandidate {
 /// taken anew each time that their number has doubled. Not thread-safe.
 class TargetIndex {
  public:
-  /// Opens all views of a segment of the map to matching: by other robots, and, if released, by its own. A segment that
-  /// is open already is replaced. Throws std::invalid_argument if its descriptors differ in size from those that are
-  /// there.
-  void Add(const SegmentKey& segment, const TargetMap& map, bool released);
+  /// Opens views of a segment of the map to matching: the oldest `released` ones by all robots, and the others, if
+  /// `others_too`, by other robots than the one that took them. What is open already stays; close a segment before its views change.
+  /// Throws std::invalid_argument if its descriptors differ in size from those that are there. O(views of it).
+  void Open(const SegmentKey& segment, const TargetMap& map, std::size_t released, bool others_too);
   /// Closes a segment; nothing happens if it isn't open.
-  void Remove(const SegmentKey& segment);
+  void Close(const SegmentKey& segment);
   /// Takes centroids from the map anew, after a correction. O(views).
   void RefreshCentroids(const TargetMap& map);
 
-  /// True if views of the segment are in the index.
-  bool Contains(const SegmentKey& segment) const { return items_.count(segment) != 0; }
   /// Segments with views in the index.
   std::size_t segments() const { return items_.size(); }
 
@@ -54,7 +53,7 @@ class TargetIndex {
                                        float max_distance) const;
   /// True if the item still stands for a view that is open to this robot.
   bool IsOpen(std::uint64_t item, RobotIndex robot) const {
-    return views_[item].live && (views_[item].released || views_[item].segment.robot != robot);
+    return views_[item].live && (views_[item].released || views_[item].robot != robot);
   }
   /// Scaled distance of two descriptors.
   float Distance(const Descriptor& a, const Descriptor& b) const { return (a - b).cwiseProduct(weights_).norm(); }
@@ -68,6 +67,7 @@ class TargetIndex {
 
  private:
   void Insert(IndexedView view);
+  void Erase(std::uint64_t item);
   void Rescale();
 
   Descriptor weights_;  // one over the scale of each dimension
