@@ -4,6 +4,7 @@
 played_drive.py prepare PROGRAM FOLDER           simulates, makes a bag of either style
 played_drive.py compare PROGRAM FOLDER STYLE CONFIG   kitti.launch without pose graph, against evaluate --no-optimization
 played_drive.py demo PROGRAM FOLDER STYLE CONFIG      demo.launch with everything: loops, files, and it ends by itself
+played_drive.py overload PROGRAM FOLDER STYLE CONFIG  played as `rosbag play -r 20` plays scans at 10 Hz: the newest are kept
 """
 import csv
 import math
@@ -112,6 +113,52 @@ def demo(program, folder, style, config):
     subprocess.run([program, "score", "--kitti", folder / "drive", "--sequence", "00", "--results", results], check=True)
 
 
+def overload(program, folder, style, config):
+    import rosgraph
+    import rospy
+    from diagnostic_msgs.msg import DiagnosticArray
+
+    results = folder / ("overload_" + style)
+    shutil.rmtree(results, ignore_errors=True)
+    results.mkdir()
+    port = own_master(results)
+    launch = subprocess.Popen(["roslaunch", "-p", str(port), "incremental_segmatch", "kitti.launch",
+                               "bag:=%s" % (folder / (style + ".bag")), "style:=" + style, "config:=%s" % config,
+                               "rate:=160", "queue_size:=3", "pose_graph:=false", "rviz:=false"])  # 0.8 s from scan to scan
+    seen = []  # the front end's diagnostics, one a second
+
+    def on_diagnostics(message):
+        for status in message.status:
+            if status.name == "front_end: front end":
+                seen.append({value.key: float(value.value) for value in status.values})
+    deadline = time.time() + TIMEOUT_S
+    while not rosgraph.is_master_online() and time.time() < deadline:
+        time.sleep(0.2)
+    rospy.init_node("overload", disable_signals=True)
+    rospy.Subscriber("/diagnostics", DiagnosticArray, on_diagnostics)
+    # The bag is through when nothing has come for some seconds.
+    while time.time() < deadline and not (
+            len(seen) > 4 and seen[-1]["scans received"] > 0 and seen[-1]["scans received"] == seen[-4]["scans received"]):
+        time.sleep(0.5)
+    launch.send_signal(signal.SIGINT)
+    launch.wait()
+    if not seen or not seen[-1]["scans received"]:
+        sys.exit("no scan was received in %d s" % TIMEOUT_S)
+    last = seen[-1]
+    received, processed = last["scans received"], last["scans processed"]
+    dropped = last["scans dropped by the full queue"]
+    skipped = sum(count for key, count in last.items() if key.startswith("scans skipped"))
+    latency_ms = max(status["arrival to segments [ms]"] for status in seen)
+    print("%d scans received, %d processed, %d dropped, %d skipped; up to %.0f ms from arrival to segments" % (
+        received, processed, dropped, skipped, latency_ms))
+    if received < 100 or processed < 4 or dropped < 1 or processed + dropped + skipped != received:
+        sys.exit("these counts are wrong, or nothing was dropped")
+    # Three wait and one is processed; a pose may be waited for besides, half a second at most.
+    step_ms = sum(value for key, value in last.items() if key.endswith("[ms]") and not key.startswith("arrival"))
+    if latency_ms > 1000.0 + 20.0 * step_ms:
+        sys.exit("latency is not bounded")
+
+
 if __name__ == "__main__":
     action, program, folder = sys.argv[1], sys.argv[2], pathlib.Path(sys.argv[3])
-    {"prepare": prepare, "compare": compare, "demo": demo}[action](program, folder, *sys.argv[4:])
+    {"prepare": prepare, "compare": compare, "demo": demo, "overload": overload}[action](program, folder, *sys.argv[4:])
