@@ -26,8 +26,6 @@ std::shared_ptr<const Points> PointsOf(const std::vector<std::int32_t>& cluster,
 }  // namespace
 
 BatchBaselineParameters BatchParametersOf(const FrontEndParameters& front_end, const RecognizerParameters& recognizer) {
-  if (std::isfinite(front_end.local_path_m))
-    throw std::invalid_argument("front_end.local_path_m: the batch pipeline knows no such limit; set it to .inf");
   BatchBaselineParameters batch;
   batch.segmentation = front_end.segmentation;
   batch.local_radius_m = front_end.local_radius_m;
@@ -84,7 +82,10 @@ BatchFrontEnd::BatchFrontEnd(const FrontEndParameters& parameters, const Recogni
     : robot_(std::move(robot)),
       ground_filter_(parameters.ground),
       baseline_(BatchParametersOf(parameters, recognizer)),
-      shown_points_(parameters.view.shown_points) {}
+      shown_points_(parameters.view.shown_points) {
+  if (std::isfinite(parameters.local_path_m))
+    throw std::invalid_argument("front_end.local_path_m: the batch pipeline knows no such limit; set it to .inf");
+}
 
 FrontEndStep BatchFrontEnd::Process(const Scan& scan) {
   FrontEndStep step;
