@@ -178,7 +178,8 @@ EvaluationResult Evaluate(DriveSource& drive, const EvaluationParameters& parame
   const RecognizerParameters& recognizer_parameters = parameters.core.back_end.recognizer;
   const bool is_batch = parameters.pipeline == Pipeline::kBatch;
   FrontEnd front_end(front_end_parameters, parameters.robot);
-  BatchFrontEnd batch_front_end(front_end_parameters, recognizer_parameters, parameters.robot);
+  std::optional<BatchFrontEnd> batch_front_end;
+  if (is_batch) batch_front_end.emplace(front_end_parameters, recognizer_parameters, parameters.robot);
   BackEnd back_end = MakeBackEnd(parameters);
   const bool optimize = parameters.optimize && parameters.map_file.empty();
   BatchComparison comparison(BatchParametersOf(front_end_parameters, recognizer_parameters));
@@ -204,7 +205,7 @@ EvaluationResult Evaluate(DriveSource& drive, const EvaluationParameters& parame
     record.stamp_ns = scan.stamp_ns;
 
     const double step_start_ms = ThreadCpuMs();
-    FrontEndStep seen = is_batch ? batch_front_end.Process(scan) : front_end.Process(scan);
+    FrontEndStep seen = is_batch ? batch_front_end->Process(scan) : front_end.Process(scan);
     BackEndStep recognized = back_end.Process(seen.delta);
     record.total_ms = ThreadCpuMs() - step_start_ms;
 
