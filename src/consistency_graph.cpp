@@ -161,7 +161,7 @@ std::size_t ScreenPortable(const ScreenArrays& arrays, std::uint32_t i, const st
 
 #ifdef SEGMATCH_HAS_AVX2_KERNEL
 /// The same as ScreenPortable, eight at a time.
-__attribute__((target("avx2"))) std::size_t ScreenAvx2(const ScreenArrays& arrays, std::uint32_t i,
+__attribute__((target("avx2,fma"))) std::size_t ScreenAvx2(const ScreenArrays& arrays, std::uint32_t i,
                                                        const std::vector<Range>& ranges, std::uint32_t* hits) {
   const float* const lx = arrays.coordinates[0].data();
   const float* const ly = arrays.coordinates[1].data();
@@ -181,8 +181,8 @@ __attribute__((target("avx2"))) std::size_t ScreenAvx2(const ScreenArrays& array
       const __m256 d = _mm256_sub_ps(_mm256_loadu_ps(tx + j), tx_i);
       const __m256 e = _mm256_sub_ps(_mm256_loadu_ps(ty + j), ty_i);
       const __m256 f = _mm256_sub_ps(_mm256_loadu_ps(tz + j), tz_i);
-      const __m256 local = _mm256_add_ps(_mm256_add_ps(_mm256_mul_ps(a, a), _mm256_mul_ps(b, b)), _mm256_mul_ps(c, c));
-      const __m256 target = _mm256_add_ps(_mm256_add_ps(_mm256_mul_ps(d, d), _mm256_mul_ps(e, e)), _mm256_mul_ps(f, f));
+      const __m256 local = _mm256_fmadd_ps(a, a, _mm256_fmadd_ps(b, b, _mm256_mul_ps(c, c)));
+      const __m256 target = _mm256_fmadd_ps(d, d, _mm256_fmadd_ps(e, e, _mm256_mul_ps(f, f)));
       const __m256 difference = _mm256_sub_ps(local, target);
       const __m256 near = _mm256_cmp_ps(_mm256_mul_ps(difference, difference),
                                         _mm256_mul_ps(factor, _mm256_add_ps(local, target)), _CMP_LE_OQ);
@@ -199,7 +199,7 @@ using ScreenFunction = std::size_t (*)(const ScreenArrays&, std::uint32_t, const
 
 ScreenFunction ChooseScreen(bool use_avx2) {
 #ifdef SEGMATCH_HAS_AVX2_KERNEL
-  if (use_avx2 && __builtin_cpu_supports("avx2")) return ScreenAvx2;
+  if (use_avx2 && __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) return ScreenAvx2;
 #endif
   (void)use_avx2;
   return ScreenPortable;

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <iterator>
 #include <limits>
+#include <optional>
 #include <stdexcept>
 #include <utility>
 
@@ -214,9 +215,91 @@ void Search::Expand(Word* candidates) {
   }
 }
 
+/// Which vertices are in the core of this order: they have as many neighbours among each other.
+std::vector<bool> InCore(const ConsistencyGraph& graph, std::size_t order) {
+  std::vector<bool> in_core(graph.vertices(), true);
+  Vertices degree(graph.vertices()), leaving;
+  for (std::uint32_t v = 0; v < graph.vertices(); ++v) {
+    degree[v] = static_cast<std::uint32_t>(graph.Neighbours(v).size());
+    if (degree[v] >= order) continue;
+    in_core[v] = false;
+    leaving.push_back(v);
+  }
+  while (!leaving.empty()) {
+    const std::uint32_t v = leaving.back();
+    leaving.pop_back();
+    for (const std::uint32_t u : graph.Neighbours(v)) {
+      if (degree[u]-- != order) continue;  // below it already, or not yet
+      in_core[u] = false;
+      leaving.push_back(u);
+    }
+  }
+  return in_core;
+}
+
+/// Without the edges that are in no clique of `size` vertices because an end is in no core of that order, or for lack of
+/// triangles with others (a truss remains). One pass, O(sum over edges of the neighbours of an end); nothing where that is too
+/// much, or where no edge goes.
+std::optional<ConsistencyGraph> WithoutUnsupportedEdges(const ConsistencyGraph& graph, std::size_t size) {
+  constexpr std::uint64_t kMostStepsPerEdge = 64;
+  const std::vector<bool> in_core = InCore(graph, size - 1);
+  std::vector<std::size_t> begin{0};  // of each vertex's neighbours with a larger number
+  Vertices later;
+  later.reserve(graph.edges);
+  for (std::uint32_t v = 0; v < graph.vertices(); ++v) {
+    if (in_core[v]) {
+      const ConsistencyGraph::Range all = graph.Neighbours(v);
+      for (const std::uint32_t* u = std::upper_bound(all.begin(), all.end(), v); u != all.end(); ++u)
+        if (in_core[*u]) later.push_back(*u);
+    }
+    begin.push_back(later.size());
+  }
+  std::uint64_t steps = 0;
+  for (const std::uint32_t u : later) steps += begin[u + 1] - begin[u];
+  if (steps > kMostStepsPerEdge * later.size()) return std::nullopt;
+
+  Vertices triangles(later.size(), 0);
+  Vertices place(graph.vertices(), 0);  // one more than where the edge to this vertex stands; 0: no edge
+  for (std::uint32_t v = 0; v < graph.vertices(); ++v) {
+    for (std::size_t e = begin[v]; e < begin[v + 1]; ++e) place[later[e]] = static_cast<std::uint32_t>(e + 1);
+    for (std::size_t e = begin[v]; e < begin[v + 1]; ++e) {
+      for (std::size_t f = begin[later[e]]; f < begin[later[e] + 1]; ++f) {
+        const std::uint32_t third = place[later[f]];
+        if (third == 0) continue;
+        ++triangles[e];
+        ++triangles[f];
+        ++triangles[third - 1];
+      }
+    }
+    for (std::size_t e = begin[v]; e < begin[v + 1]; ++e) place[later[e]] = 0;
+  }
+  std::vector<ConsistencyGraph::Edge> kept;
+  for (std::uint32_t v = 0; v < graph.vertices(); ++v) {
+    for (std::size_t e = begin[v]; e < begin[v + 1]; ++e) {
+      if (triangles[e] + 2 >= size) kept.emplace_back(v, later[e]);
+    }
+  }
+  if (kept.size() == graph.edges) return std::nullopt;
+  return ConsistencyGraph::FromEdges(graph.vertices(), kept);
+}
+
+/// The same again and again, as long as it pays: all cliques of at least `size` vertices are left.
+ConsistencyGraph Reduced(const ConsistencyGraph& graph, std::size_t size) {
+  std::optional<ConsistencyGraph> reduced = WithoutUnsupportedEdges(graph, size);
+  if (!reduced) return graph;
+  for (std::size_t before = graph.edges; reduced->edges > 0 && 4 * reduced->edges < 3 * before;) {
+    before = reduced->edges;
+    std::optional<ConsistencyGraph> further = WithoutUnsupportedEdges(*reduced, size);
+    if (!further) break;
+    reduced = std::move(further);
+  }
+  return std::move(*reduced);
+}
+
 /// The vertices of a graph that are in a core of some order, renumbered in degeneracy order.
 class CoreGraph {
  public:
+  CoreGraph() = default;
   CoreGraph(const ConsistencyGraph& whole, std::size_t min_core);
 
   std::size_t size() const { return names_.size(); }
@@ -295,9 +378,8 @@ class Finder {
   Finder(const ConsistencyGraph& graph, const MaxCliqueParameters& parameters, const CliqueOrder& better)
       : parameters_(parameters),
         better_(better),
-        graph_(graph, parameters.min_size - 1),
-        floor_(parameters.min_size - 1),
-        local_index_(graph_.size(), 0) {}
+        reduced_(graph),
+        floor_(parameters.min_size - 1) {}
 
   MaxCliqueResult Find();
 
@@ -305,6 +387,7 @@ class Finder {
   using Report = std::function<std::size_t(Vertices)>;
 
   void GrowGreedily();
+  void KeepCliquesOf(std::size_t size);
   bool Maximize();
   void CompareTies();
   Vertices Members(std::uint32_t v, std::size_t floor);
@@ -314,7 +397,8 @@ class Finder {
   const Clock::time_point start_ = Clock::now();
   const MaxCliqueParameters& parameters_;
   const CliqueOrder& better_;
-  const CoreGraph graph_;
+  ConsistencyGraph reduced_;  ///< the given one, without what can't matter any more
+  CoreGraph graph_;           ///< of it
   Vertices best_;      ///< incumbent in the original graph, sorted
   std::size_t floor_;  ///< only larger cliques are looked for
   MaxCliqueResult result_;
@@ -329,26 +413,42 @@ Vertices Finder::Named(const Vertices& clique) const {
   return names;
 }
 
-/// A first incumbent: from the last vertices of the order on, always add the candidate that is last in the order.
+/// An incumbent, if one of the cliques around the vertices of the highest degrees is larger than the last: grown by the
+/// candidate of the highest degree, again and again.
 void Finder::GrowGreedily() {
-  constexpr std::uint32_t kStarts = 16;
-  const auto size = static_cast<std::uint32_t>(graph_.size());
-  for (std::uint32_t start = 0; start < std::min(kStarts, size); ++start) {
-    const std::uint32_t v = size - 1 - start;
-    if (graph_.core(v) < floor_ || Clock::now() - start_ >= parameters_.deadline) return;
-    Vertices candidates(graph_.Neighbours(v).begin(), graph_.Neighbours(v).end());
-    Vertices clique{v};
-    while (!candidates.empty()) {
-      clique.push_back(candidates.back());
-      const ConsistencyGraph::Range all = graph_.Neighbours(clique.back());
+  constexpr std::size_t kStarts = 16;
+  const auto before = [this](std::uint32_t a, std::uint32_t b) {
+    const std::size_t degree_a = reduced_.Neighbours(a).size(), degree_b = reduced_.Neighbours(b).size();
+    return degree_a > degree_b || (degree_a == degree_b && a < b);
+  };
+  Vertices starts(reduced_.vertices());
+  for (std::uint32_t v = 0; v < starts.size(); ++v) starts[v] = v;
+  const std::size_t count = std::min(kStarts, starts.size());
+  std::partial_sort(starts.begin(), starts.begin() + static_cast<std::ptrdiff_t>(count), starts.end(), before);
+  starts.resize(count);
+  for (const std::uint32_t start : starts) {
+    if (reduced_.Neighbours(start).size() < floor_ || Clock::now() - start_ >= parameters_.deadline) return;
+    Vertices candidates(reduced_.Neighbours(start).begin(), reduced_.Neighbours(start).end());
+    Vertices clique{start};
+    while (!candidates.empty() && clique.size() + candidates.size() > floor_) {
+      clique.push_back(*std::min_element(candidates.begin(), candidates.end(), before));
+      const ConsistencyGraph::Range all = reduced_.Neighbours(clique.back());
       Vertices common;
       std::set_intersection(candidates.begin(), candidates.end(), all.begin(), all.end(), std::back_inserter(common));
       candidates.swap(common);
     }
-    if (clique.size() <= floor_) continue;
+    if (!candidates.empty() || clique.size() <= floor_) continue;
     floor_ = clique.size();
-    best_ = Named(clique);
+    std::sort(clique.begin(), clique.end());
+    best_ = std::move(clique);
   }
+}
+
+/// Drops what is in no clique of at least `size` vertices.
+void Finder::KeepCliquesOf(std::size_t size) {
+  reduced_ = Reduced(reduced_, size);
+  graph_ = CoreGraph(reduced_, size - 1);
+  local_index_.resize(graph_.size(), 0);
 }
 
 /// Later neighbours of v that may be with it in a clique of more than `floor` vertices: each has at least floor - 1
@@ -458,10 +558,18 @@ void Finder::CompareTies() {
 }
 
 MaxCliqueResult Finder::Find() {
+  const bool compares_ties = parameters_.max_ties > 1;
+  const auto smallest_wanted = [&] { return std::max(parameters_.min_size, compares_ties ? floor_ : floor_ + 1); };
   GrowGreedily();
+  const std::size_t known = floor_;
+  KeepCliquesOf(smallest_wanted());
+  GrowGreedily();
+  if (floor_ > known) KeepCliquesOf(smallest_wanted());
+  const std::size_t kept = smallest_wanted();
   result_.proven_maximum = Maximize();
   if (!best_.empty()) {
-    if (result_.proven_maximum && parameters_.max_ties > 1) {
+    if (result_.proven_maximum && compares_ties) {
+      if (floor_ > kept) KeepCliquesOf(floor_);
       CompareTies();
     } else {
       result_.all_ties_compared = false;

@@ -36,14 +36,15 @@ using CliqueOrder = std::function<bool(const std::vector<std::uint32_t>&, const 
 /// A maximum clique of at least min_size vertices. Of several the one that `better` prefers is returned; without it the
 /// lexicographically smallest list.
 ///
-/// Vertices that are in no core of order min_size - 1 are dropped, the others visited in degeneracy order (bucket sort,
-/// Batagelj and Zaversnik); each one's later neighbourhood is searched by branch and bound on bit sets with greedy
-/// colouring and recolouring as bound (after Tomita et al., MCS). A second pass, only when the size is proven, looks
-/// through the cliques of that size for the best of them.
+/// A first incumbent is grown greedily around the vertices of the highest degrees. What is in no larger clique, because a
+/// vertex is in no core of that order or an edge in too few triangles (trusses, Cohen), is dropped. Vertices that are
+/// left are visited in degeneracy order (bucket sort, Batagelj and Zaversnik); each one's later neighbourhood is searched
+/// by branch and bound on bit sets with greedy colouring and recolouring as bound (after Tomita et al., MCS). A second
+/// pass, only when the size is proven, looks through the cliques of that size for the best of them.
 ///
 /// Deterministic for a given labelling of the vertices unless the deadline passes. Where all_ties_compared the answer
 /// does not depend on the labelling either, given that `better` does not; label by something canonical for the rest.
-/// Exponential in the worst case, near O(vertices + edges) where few vertices survive the cores. Throws
+/// Exponential in the worst case, near O(vertices + edges) where few edges survive. Throws
 /// std::invalid_argument naming a parameter that is out of range.
 MaxCliqueResult FindMaxClique(const ConsistencyGraph& graph, const MaxCliqueParameters& parameters,
                               const CliqueOrder& better = {});
