@@ -20,7 +20,7 @@ constexpr int kSide = DynamicVoxelGrid::kBlockSide;
 constexpr int kBlocksPerTileSide = 8;
 constexpr int kLinkCenter = 13;  // index of the block itself among its 27 links
 
-std::int16_t LinkIndex(int dx, int dy, int dz) { return static_cast<std::int16_t>(kLinkCenter + dx + 3 * dy + 9 * dz); }
+int LinkIndex(int dx, int dy, int dz) { return kLinkCenter + dx + 3 * dy + 9 * dz; }
 
 int FloorDivide(int value, int divisor) { return value >= 0 ? value / divisor : -((divisor - 1 - value) / divisor); }
 
@@ -59,8 +59,13 @@ NeighbourStencil::NeighbourStencil(double radius_m, double resolution_m) : radiu
           }
           if (visit.cells == 0) continue;
           visit.offset = {static_cast<std::int8_t>(bx), static_cast<std::int8_t>(by), static_cast<std::int8_t>(bz)};
-          if (std::max({std::abs(bx), std::abs(by), std::abs(bz)}) <= 1) visit.link = LinkIndex(bx, by, bz);
-          visits_[cell].push_back(visit);
+          if (std::max({std::abs(bx), std::abs(by), std::abs(bz)}) > 1) {
+            around_[cell].farther.push_back(visit);
+            continue;
+          }
+          const int link = LinkIndex(bx, by, bz);
+          around_[cell].links |= 1u << link;
+          around_[cell].adjacent[link] = visit;
         }
   }
 }
@@ -296,16 +301,16 @@ std::size_t DynamicVoxelGrid::FindVoxels(const Chunk& chunk, Run* runs, VoxelUpd
       continue;
     }
     *++run = {slot, chunk.cell[i], 1, in_block};
-    __builtin_prefetch(&block(slot));
-    __builtin_prefetch(&block(slot).voxels[chunk.cell[i]], 1);
+    __builtin_prefetch(&blocks_[slot], 1);
+    __builtin_prefetch(&voxels_[slot][chunk.cell[i]], 1);
   }
   return static_cast<std::size_t>(run + 1 - runs);
 }
 
 /// While a voxel is touched its centroid is the sum of its points.
 void DynamicVoxelGrid::AddRun(const Run& run, VoxelUpdate* update) {
-  Block& home = block(run.slot);
-  Voxel& voxel = home.voxels[run.cell];
+  Block& home = blocks_[run.slot];
+  Voxel& voxel = voxels_[run.slot][run.cell];
   const std::uint64_t bit = std::uint64_t{1} << run.cell;
   const VoxelHandle handle = run.slot * kCellsPerBlock + run.cell;
   if (!(home.touched & bit)) {
@@ -330,12 +335,12 @@ void DynamicVoxelGrid::AddRun(const Run& run, VoxelUpdate* update) {
 void DynamicVoxelGrid::SettleTouched(VoxelUpdate* update) {
   constexpr std::size_t kAhead = 16;
   const auto prefetch = [this](VoxelHandle voxel) {
-    __builtin_prefetch(&block(voxel / kCellsPerBlock), 1);
-    __builtin_prefetch(&block(voxel / kCellsPerBlock).voxels[voxel % kCellsPerBlock], 1);
+    __builtin_prefetch(&blocks_[voxel / kCellsPerBlock], 1);
+    __builtin_prefetch(&VoxelAt(voxel), 1);
   };
   const auto settle = [this](VoxelHandle handle) -> const Voxel& {
-    Block& home = block(handle / kCellsPerBlock);
-    Voxel& voxel = home.voxels[handle % kCellsPerBlock];
+    Block& home = blocks_[handle / kCellsPerBlock];
+    Voxel& voxel = VoxelAt(handle);
     home.touched &= ~(std::uint64_t{1} << (handle % kCellsPerBlock));
     home.last_insertion = insertions_;
     voxel.centroid_block *= 1.f / static_cast<float>(voxel.count);
@@ -352,7 +357,7 @@ void DynamicVoxelGrid::SettleTouched(VoxelUpdate* update) {
     const VoxelHandle handle = touched_inactive_[i];
     if (i + kAhead < touched_inactive_.size()) prefetch(touched_inactive_[i + kAhead]);
     if (settle(handle).count < min_points) continue;
-    block(handle / kCellsPerBlock).active |= std::uint64_t{1} << (handle % kCellsPerBlock);
+    blocks_[handle / kCellsPerBlock].active |= std::uint64_t{1} << (handle % kCellsPerBlock);
     update->activated.push_back(handle);
   }
   active_voxels_ += update->activated.size();
@@ -381,7 +386,7 @@ VoxelUpdate DynamicVoxelGrid::RemoveOutside(const Eigen::Vector3d& center_odom, 
       continue;
     for (std::size_t i = tile.blocks.size(); i-- > 0;) {  // backwards: removal swaps the last one in
       const std::uint32_t slot = tile.blocks[i];
-      const Block& candidate = block(slot);
+      const Block& candidate = blocks_[slot];
       const Eigen::Vector3d corner = BlockCorner(slot * kCellsPerBlock);
       const auto [nearest2, farthest2] = distances2(corner.x(), corner.y(), block_m);
       const bool is_old = candidate.last_insertion < oldest_insertion;
@@ -389,7 +394,7 @@ VoxelUpdate DynamicVoxelGrid::RemoveOutside(const Eigen::Vector3d& center_odom, 
       std::uint64_t leaving = is_old ? candidate.occupied : 0;
       for (std::uint64_t cells = candidate.occupied & ~leaving; cells != 0; cells &= cells - 1) {
         const int cell = __builtin_ctzll(cells);
-        const Eigen::Vector3f& c = candidate.voxels[cell].centroid_block;
+        const Eigen::Vector3f& c = voxels_[slot][cell].centroid_block;
         const double dx = corner.x() + c.x() - center.x(), dy = corner.y() + c.y() - center.y();
         if (nearest2 > radius2 || dx * dx + dy * dy > radius2) leaving |= std::uint64_t{1} << cell;
       }
@@ -401,10 +406,10 @@ VoxelUpdate DynamicVoxelGrid::RemoveOutside(const Eigen::Vector3d& center_odom, 
 }
 
 void DynamicVoxelGrid::RemoveCells(std::uint32_t slot, std::uint64_t cells, VoxelUpdate* update) {
-  Block& home = block(slot);
+  Block& home = blocks_[slot];
   for (std::uint64_t active = cells & home.active; active != 0; active &= active - 1) {
     const VoxelHandle cell = static_cast<VoxelHandle>(__builtin_ctzll(active));
-    update->removed.push_back({slot * kCellsPerBlock + cell, home.voxels[cell].centroid_block});
+    update->removed.push_back({slot * kCellsPerBlock + cell, voxels_[slot][cell].centroid_block});
   }
   occupied_voxels_ -= static_cast<std::size_t>(__builtin_popcountll(cells));
   home.occupied &= ~cells;
@@ -422,11 +427,14 @@ std::uint32_t DynamicVoxelGrid::AddBlock(const std::array<std::int32_t, 3>& coor
     slot = free_blocks_.back();
     free_blocks_.pop_back();
   } else {
-    if (block_slots_ % kBlocksPerPage == 0) pages_.push_back(std::make_unique<Block[]>(kBlocksPerPage));
     slot = block_slots_++;
+    blocks_.Grow(block_slots_);
+    links_.Grow(block_slots_);
+    voxels_.Grow(block_slots_);
   }
-  Block& added = block(slot);
+  Block& added = blocks_[slot];
   added.coordinates = coordinates;
+  added.linked = 0;
   for (int dz = -1; dz <= 1; ++dz)
     for (int dy = -1; dy <= 1; ++dy)
       for (int dx = -1; dx <= 1; ++dx)
@@ -434,12 +442,14 @@ std::uint32_t DynamicVoxelGrid::AddBlock(const std::array<std::int32_t, 3>& coor
   for (int dz = -1; dz <= 1; ++dz)
     for (int dy = -1; dy <= 1; ++dy)
       for (int dx = -1; dx <= 1; ++dx) {
-        const std::int16_t link = LinkIndex(dx, dy, dz);
+        const int link = LinkIndex(dx, dy, dz);
         if (link == kLinkCenter) continue;
-        added.links[link] = FindBlock({coordinates[0] + dx, coordinates[1] + dy, coordinates[2] + dz});
-        if (added.links[link] != kNoBlock) block(added.links[link]).links[2 * kLinkCenter - link] = slot;
+        const std::uint32_t neighbour = FindBlock({coordinates[0] + dx, coordinates[1] + dy, coordinates[2] + dz});
+        if (neighbour == kNoBlock) continue;
+        SetLink(slot, link, neighbour);
+        SetLink(neighbour, 2 * kLinkCenter - link, slot);
       }
-  added.links[kLinkCenter] = slot;
+  SetLink(slot, kLinkCenter, slot);
   block_map_->Insert(PackBlock(coordinates), slot);
   added.tile = tiles_->FindOrAdd(FloorDivide(coordinates[0], kBlocksPerTileSide), FloorDivide(coordinates[1], kBlocksPerTileSide));
   std::vector<std::uint32_t>& members = tiles_->tile(added.tile).blocks;
@@ -448,15 +458,21 @@ std::uint32_t DynamicVoxelGrid::AddBlock(const std::array<std::int32_t, 3>& coor
   return slot;
 }
 
+void DynamicVoxelGrid::SetLink(std::uint32_t slot, int link, std::uint32_t to) {
+  links_[slot][link] = to;
+  blocks_[slot].linked |= 1u << link;
+}
+
 void DynamicVoxelGrid::RemoveBlock(std::uint32_t slot) {
-  Block& removed = block(slot);
-  for (int link = 0; link < 27; ++link)
-    if (link != kLinkCenter && removed.links[link] != kNoBlock)
-      block(removed.links[link]).links[2 * kLinkCenter - link] = kNoBlock;
+  const Block& removed = blocks_[slot];
+  for (std::uint32_t linked = removed.linked; linked != 0; linked &= linked - 1) {
+    const int link = __builtin_ctz(linked);
+    if (link != kLinkCenter) blocks_[links_[slot][link]].linked &= ~(1u << (2 * kLinkCenter - link));
+  }
   block_map_->Erase(PackBlock(removed.coordinates));
   std::vector<std::uint32_t>& members = tiles_->tile(removed.tile).blocks;
   members[removed.position_in_tile] = members.back();
-  block(members.back()).position_in_tile = removed.position_in_tile;
+  blocks_[members.back()].position_in_tile = removed.position_in_tile;
   members.pop_back();
   if (members.empty()) tiles_->Free(removed.tile);
   free_blocks_.push_back(slot);
@@ -465,16 +481,16 @@ void DynamicVoxelGrid::RemoveBlock(std::uint32_t slot) {
 std::size_t DynamicVoxelGrid::handle_capacity() const { return std::size_t{block_slots_} * kCellsPerBlock; }
 
 std::size_t DynamicVoxelGrid::memory_bytes() const {
-  return pages_.size() * kBlocksPerPage * sizeof(Block) + free_blocks_.capacity() * sizeof(std::uint32_t) +
-         block_map_->memory_bytes() + tiles_->memory_bytes() + touched_inactive_.capacity() * sizeof(VoxelHandle);
+  return blocks_.memory_bytes() + links_.memory_bytes() + voxels_.memory_bytes() +
+         free_blocks_.capacity() * sizeof(std::uint32_t) + block_map_->memory_bytes() + tiles_->memory_bytes() + touched_inactive_.capacity() * sizeof(VoxelHandle);
 }
 
 bool DynamicVoxelGrid::IsActive(VoxelHandle voxel) const {
-  return voxel < handle_capacity() && (block(voxel / kCellsPerBlock).active >> (voxel % kCellsPerBlock) & 1) != 0;
+  return voxel < handle_capacity() && (blocks_[voxel / kCellsPerBlock].active >> (voxel % kCellsPerBlock) & 1) != 0;
 }
 
 std::uint32_t DynamicVoxelGrid::PointCount(VoxelHandle voxel) const {
-  return block(voxel / kCellsPerBlock).voxels[voxel % kCellsPerBlock].count;
+  return VoxelAt(voxel).count;
 }
 
 std::vector<VoxelHandle> DynamicVoxelGrid::ActiveVoxels() const {
@@ -482,7 +498,7 @@ std::vector<VoxelHandle> DynamicVoxelGrid::ActiveVoxels() const {
   voxels.reserve(active_voxels_);
   for (const TileMap::Tile& tile : tiles_->tiles())
     for (const std::uint32_t slot : tile.blocks)
-      for (std::uint64_t cells = block(slot).active; cells != 0; cells &= cells - 1)
+      for (std::uint64_t cells = blocks_[slot].active; cells != 0; cells &= cells - 1)
         voxels.push_back(slot * kCellsPerBlock + static_cast<VoxelHandle>(__builtin_ctzll(cells)));
   return voxels;
 }

@@ -33,8 +33,11 @@ std::uint64_t LanesAtMost(const Eigen::Array4f& lanes, float limit) {
 int UnitsPerCell(const NeighbourStencil& stencil, double radius_cells) {
   std::size_t most_neighbours = 0;
   for (unsigned cell = 0; cell < kCells; ++cell) {
+    const NeighbourStencil::Neighbourhood& around = stencil.around(cell);
     std::size_t cells = 0;
-    for (const NeighbourStencil::BlockVisit& visit : stencil.visits(cell))
+    for (const NeighbourStencil::BlockVisit& visit : around.adjacent)
+      cells += static_cast<std::size_t>(__builtin_popcountll(visit.cells));
+    for (const NeighbourStencil::BlockVisit& visit : around.farther)
       cells += static_cast<std::size_t>(__builtin_popcountll(visit.cells));
     most_neighbours = std::max(most_neighbours, cells);
   }

@@ -80,7 +80,10 @@ void IncrementalSegmenter<Policy>::FollowCentroids(const std::vector<MovedVoxel>
   const BlockNode* block = nullptr;
   Eigen::Vector3d corner = Eigen::Vector3d::Zero();
   Label root = kNoLabel;
-  for (const MovedVoxel& moved : moved_voxels) {
+  constexpr std::size_t kAhead = 16;
+  for (std::size_t i = 0; i < moved_voxels.size(); ++i) {
+    const MovedVoxel& moved = moved_voxels[i];
+    if (i + kAhead < moved_voxels.size()) __builtin_prefetch(&BlockOf(moved_voxels[i + kAhead].voxel));
     if (block != &BlockOf(moved.voxel)) {
       block = &BlockOf(moved.voxel);
       corner = grid_->BlockCorner(moved.voxel);

@@ -36,7 +36,10 @@ class KeySet {
 /// 21 bits an axis: 600 km at cells of 0.3 m.
 std::uint64_t CellOf(const Eigen::Vector3f& p, float per_metre) {
   const auto index = [per_metre](float value) {
-    return static_cast<std::uint64_t>(static_cast<std::int64_t>(std::floor(value * per_metre)) + (1 << 20)) & 0x1fffff;
+    const float cells = value * per_metre;
+    const auto towards_zero = static_cast<std::int64_t>(cells);
+    const std::int64_t floor = towards_zero - (cells < static_cast<float>(towards_zero) ? 1 : 0);
+    return static_cast<std::uint64_t>(floor + (1 << 20)) & 0x1fffff;
   };
   return index(p.x()) << 42 | index(p.y()) << 21 | index(p.z());
 }
@@ -50,11 +53,14 @@ Points ThinScan(const Points& points_sensor, const ScanThinningParameters& param
   const float per_metre = static_cast<float>(1.0 / parameters.cell_size_m);
   KeySet cells(looked_at);
   Points thinned;
+  std::uint64_t last = ~std::uint64_t{0};  // points that follow each other in a scan often share a cell
   for (std::size_t i = 0; i < looked_at; ++i) {
     const Eigen::Vector3f& p = points_sensor[i * points_sensor.size() / looked_at];
     const float range2 = p.head<2>().squaredNorm();
     if (!(range2 >= min2 && range2 <= max2) || !std::isfinite(p.z())) continue;
-    if (cells.Add(CellOf(p, per_metre))) thinned.push_back(p);
+    const std::uint64_t cell = CellOf(p, per_metre);
+    if (cell != last && cells.Add(cell)) thinned.push_back(p);
+    last = cell;
   }
   return thinned;
 }

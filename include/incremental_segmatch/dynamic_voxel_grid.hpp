@@ -10,6 +10,7 @@
 #include <memory>
 #include <vector>
 
+#include "incremental_segmatch/paged_array.hpp"
 #include "incremental_segmatch/types.hpp"
 
 namespace incremental_segmatch {
@@ -58,17 +59,22 @@ class NeighbourStencil {
   /// A block to look into, and which of its cells.
   struct BlockVisit {
     std::array<std::int8_t, 3> offset{};  ///< in blocks
-    std::int16_t link = -1;               ///< index of an adjacent block's link, -1 if it must be looked up
     std::uint64_t cells = 0;              ///< candidates within that block
   };
-  /// Blocks that hold cells within the radius of a cell of a block (0 to 63).
-  const std::vector<BlockVisit>& visits(unsigned cell) const { return visits_[cell]; }
+  /// Of a cell of a block (0 to 63): the blocks that hold cells within the radius.
+  struct Neighbourhood {
+    std::uint32_t links = 0;                    ///< which of adjacent, by the indices of their links
+    std::array<BlockVisit, 27> adjacent;        ///< those next to the block, and itself, by link
+    std::vector<BlockVisit> farther;            ///< those that must be looked up
+  };
+  /// Around a cell.
+  const Neighbourhood& around(unsigned cell) const { return around_[cell]; }
   /// The radius.
   double radius_m() const { return radius_m_; }
 
  private:
   double radius_m_;
-  std::array<std::vector<BlockVisit>, 64> visits_;
+  std::array<Neighbourhood, 64> around_;
 };
 
 /// Voxels in blocks of 4 x 4 x 4 cells, the blocks in a hash map with links to their 26 neighbours. A voxel's handle is
@@ -125,14 +131,14 @@ class DynamicVoxelGrid {
   std::uint32_t PointCount(VoxelHandle voxel) const;
   /// Lower corner of the block that the voxel belongs to, in the grid's frame (exact multiples of 4 cells).
   Eigen::Vector3d BlockCorner(VoxelHandle voxel) const {
-    const std::array<std::int32_t, 3>& c = block(voxel / kCellsPerBlock).coordinates;
+    const std::array<std::int32_t, 3>& c = blocks_[voxel / kCellsPerBlock].coordinates;
     const double side_m = kBlockSide * parameters_.resolution_m;
     return {c[0] * side_m + parameters_.center_m[0], c[1] * side_m + parameters_.center_m[1],
             c[2] * side_m + parameters_.center_m[2]};
   }
   /// Centroid relative to BlockCorner.
   const Eigen::Vector3f& CentroidInBlock(VoxelHandle voxel) const {
-    return block(voxel / kCellsPerBlock).voxels[voxel % kCellsPerBlock].centroid_block;
+    return VoxelAt(voxel).centroid_block;
   }
   /// Centroid in the grid's frame.
   Eigen::Vector3d CentroidGrid(VoxelHandle voxel) const {
@@ -168,7 +174,7 @@ class DynamicVoxelGrid {
     Eigen::Vector3f centroid_block;
     std::uint32_t count;
   };
-  struct Block {
+  struct alignas(64) Block {
     std::uint64_t occupied = 0;  ///< cells with at least one point
     std::uint64_t active = 0;    ///< cells with at least min_points_per_voxel
     std::uint64_t touched = 0;   ///< cells that got points in the running Insert
@@ -176,15 +182,15 @@ class DynamicVoxelGrid {
     std::array<std::int32_t, 3> coordinates{};
     std::uint32_t tile = 0;
     std::uint32_t position_in_tile = 0;
-    std::array<std::uint32_t, 27> links{};
-    std::array<Voxel, kCellsPerBlock> voxels;
+    std::uint32_t linked = 0;  ///< which of its links lead to a block
   };
-  static constexpr std::uint32_t kBlocksPerPage = 256;
+  using Links = std::array<std::uint32_t, 32>;  ///< to the 26 blocks around and to itself; 27 are used
   class BlockMap;
   class TileMap;
 
-  Block& block(std::uint32_t slot) { return pages_[slot / kBlocksPerPage][slot % kBlocksPerPage]; }
-  const Block& block(std::uint32_t slot) const { return pages_[slot / kBlocksPerPage][slot % kBlocksPerPage]; }
+  Voxel& VoxelAt(VoxelHandle voxel) { return voxels_[voxel / kCellsPerBlock][voxel % kCellsPerBlock]; }
+  const Voxel& VoxelAt(VoxelHandle voxel) const { return voxels_[voxel / kCellsPerBlock][voxel % kCellsPerBlock]; }
+  void SetLink(std::uint32_t slot, int link, std::uint32_t to);
   /// Points in the sensor's frame to cells, relative to the middle of the grid: R p + t.
   struct CellTransform {
     std::array<std::array<double, 3>, 3> R;
@@ -207,7 +213,10 @@ class DynamicVoxelGrid {
   DynamicVoxelGridParameters parameters_;
   float block_size_m_ = 0.f;
   Pose T_odom_grid_ = Pose::Identity();
-  std::vector<std::unique_ptr<Block[]>> pages_;
+  // By slot. A point needs one cache line of the first and one of the third.
+  PagedArray<Block> blocks_;
+  PagedArray<Links> links_;
+  PagedArray<std::array<Voxel, kCellsPerBlock>> voxels_;
   std::uint32_t block_slots_ = 0;  ///< slots ever used
   std::vector<std::uint32_t> free_blocks_;
   std::unique_ptr<BlockMap> block_map_;
@@ -221,12 +230,16 @@ class DynamicVoxelGrid {
 
 template <class Visit>
 void DynamicVoxelGrid::ForEachStencilBlock(const NeighbourStencil& stencil, VoxelHandle voxel, Visit&& visit) const {
-  const Block& home = block(voxel / kCellsPerBlock);
-  for (const NeighbourStencil::BlockVisit& at : stencil.visits(voxel % kCellsPerBlock)) {
-    const std::uint32_t slot = at.link >= 0
-                                   ? home.links[at.link]
-                                   : FindBlock({home.coordinates[0] + at.offset[0], home.coordinates[1] + at.offset[1],
-                                                home.coordinates[2] + at.offset[2]});
+  const Block& home = blocks_[voxel / kCellsPerBlock];
+  const Links& links = links_[voxel / kCellsPerBlock];
+  const NeighbourStencil::Neighbourhood& around = stencil.around(voxel % kCellsPerBlock);
+  for (std::uint32_t linked = around.links & home.linked; linked != 0; linked &= linked - 1) {
+    const int link = __builtin_ctz(linked);
+    if (!visit(links[link], around.adjacent[link])) return;
+  }
+  for (const NeighbourStencil::BlockVisit& at : around.farther) {
+    const std::uint32_t slot = FindBlock({home.coordinates[0] + at.offset[0], home.coordinates[1] + at.offset[1],
+                                          home.coordinates[2] + at.offset[2]});
     if (slot != kNoBlock && !visit(slot, at)) return;
   }
 }
@@ -235,7 +248,7 @@ template <class Visit>
 void DynamicVoxelGrid::ForEachNeighbourBlock(const NeighbourStencil& stencil, VoxelHandle voxel, Visit&& visit) const {
   const Eigen::Vector3f center = CentroidInBlock(voxel);
   ForEachStencilBlock(stencil, voxel, [&](std::uint32_t slot, const NeighbourStencil::BlockVisit& at) {
-    const std::uint64_t cells = block(slot).active & at.cells;
+    const std::uint64_t cells = blocks_[slot].active & at.cells;
     if (cells == 0) return true;
     const Eigen::Vector3f shift(at.offset[0] * block_size_m_ - center.x(), at.offset[1] * block_size_m_ - center.y(),
                                 at.offset[2] * block_size_m_ - center.z());
