@@ -46,12 +46,7 @@ class PagedArray {
  private:
   static constexpr std::size_t kHugePage = std::size_t{1} << 21;
   static constexpr std::size_t kPageBytes = kHugePage;
-  static constexpr std::size_t LargestPowerOfTwo(std::size_t most) {
-    std::size_t power = 1;
-    while (2 * power <= most) power *= 2;
-    return power;
-  }
-  static constexpr std::size_t kPerPage = LargestPowerOfTwo(kPageBytes / sizeof(T));
+  static constexpr std::size_t kPerPage = kPageBytes / sizeof(T);
   struct Free {
     void operator()(T* memory) const { ::operator delete (memory, std::align_val_t{kHugePage}); }
   };
