@@ -234,6 +234,7 @@ TEST(Presets, FindSegmentsWithTheirSensors) {
   for (const auto& [preset, drive] :
        {std::make_pair("hdl64e", street + "--sensor HDL-64E"), std::make_pair("hdl32e", street + "--sensor HDL-32E"),
         std::make_pair("vlp16", street + "--sensor VLP-16"), std::make_pair("os1_128", street + "--sensor OS1-128"),
+        std::make_pair("livox_avia", street + "--sensor Livox-Avia --sensor-height 1.2"),
         std::make_pair("indoor", office + "--sensor VLP-16 --sensor-height 0.6")}) {
     SCOPED_TRACE(preset);
     const Outcome run = Segmatch(std::string("evaluate --simulate --max-steps 12 ") + drive + " --config " +
