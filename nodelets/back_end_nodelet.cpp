@@ -383,10 +383,9 @@ void BackEndNodelet::CorrectPose(const std::string& robot_name, const nav_msgs::
   if (sessions.empty()) return;
   const std::string& session = sessions.back();
   Robot& robot = robots_.at(session);
-  const Pose T_base_sensor =
-      parameters_.trajectory_kind == FrameKind::kBase ? robot.frames.T_base_sensor : Pose::Identity();
-  const StampedPose pose{ToStampNs(odometry.header.stamp),
-                         ToPose(odometry.pose.pose, "corrected_odometry") * T_base_sensor};
+  const StampedPose pose{
+      ToStampNs(odometry.header.stamp),
+      ToSensorPose(odometry.pose.pose, "corrected_odometry", parameters_.trajectory_kind, robot.frames)};
   if (!robot.corrected.empty() && pose.stamp_ns <= robot.corrected.back().stamp_ns) return;
   robot.corrected.push_back(pose);
 

@@ -324,12 +324,17 @@ nav_msgs::Path ToPath(const std::vector<StampedPose>& trajectory, FrameKind fram
   return path;
 }
 
+Pose ToSensorPose(const geometry_msgs::Pose& pose, const std::string& name, FrameKind frame_kind,
+                  const RobotFrames& robot) {
+  const Pose T_parent_frame = ToPose(pose, name);
+  return frame_kind == FrameKind::kBase ? T_parent_frame * robot.T_base_sensor : T_parent_frame;
+}
+
 std::vector<StampedPose> ToTrajectory(const nav_msgs::Path& path, FrameKind frame_kind, const RobotFrames& robot) {
-  const Pose T_base_sensor = frame_kind == FrameKind::kBase ? robot.T_base_sensor : Pose::Identity();
   std::vector<StampedPose> trajectory;
   trajectory.reserve(path.poses.size());
   for (const geometry_msgs::PoseStamped& pose : path.poses)
-    trajectory.push_back({ToStampNs(pose.header.stamp), ToPose(pose.pose, "trajectory") * T_base_sensor});
+    trajectory.push_back({ToStampNs(pose.header.stamp), ToSensorPose(pose.pose, "trajectory", frame_kind, robot)});
   return trajectory;
 }
 

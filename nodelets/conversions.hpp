@@ -88,7 +88,10 @@ SensorClosure ToSensorClosure(const LoopClosure& message, const RobotFrames& que
 /// A trajectory of sensor poses as a path of base or sensor poses in `frame`.
 nav_msgs::Path ToPath(const std::vector<StampedPose>& trajectory, FrameKind frame_kind, const RobotFrames& robot,
                       const std::string& frame, const ros::Time& stamp);
-/// And back to sensor poses.
+/// A base or sensor pose as a sensor pose; `name` of the input for the error. Throws std::invalid_argument as ToPose does.
+Pose ToSensorPose(const geometry_msgs::Pose& pose, const std::string& name, FrameKind frame_kind,
+                  const RobotFrames& robot);
+/// A path back to sensor poses.
 std::vector<StampedPose> ToTrajectory(const nav_msgs::Path& path, FrameKind frame_kind, const RobotFrames& robot);
 
 /// Names and values of a step's funnel.

@@ -275,10 +275,8 @@ void FrontEndNodelet::FollowJump(const nav_msgs::Path& path) {
       return std::abs(pose.stamp_ns - stamp_ns) < kSameStampNs;
     });
     if (used == history_.rend()) continue;
-    const Pose T_base_sensor =
-        parameters_.trajectory_kind == FrameKind::kBase ? frames_.T_base_sensor : Pose::Identity();
-    const Pose T_frame_sensor = ToPose(corrected->pose, "trajectory") * T_base_sensor;
-    const Pose T_new_old = T_frame_sensor * used->T_frame_sensor.inverse();
+    const Pose T_new_old = ToSensorPose(corrected->pose, "trajectory", parameters_.trajectory_kind, frames_) *
+                           used->T_frame_sensor.inverse();
     if (T_new_old.isApprox(Pose::Identity(), 1e-6)) return;
     front_end_->ApplyJump(T_new_old);
     for (StampedPose& pose : history_) pose.T_frame_sensor = T_new_old * pose.T_frame_sensor;

@@ -451,7 +451,7 @@ std::optional<Closure> BackEnd::Verify(RobotIndex robot, StampNs stamp_ns, const
     return std::nullopt;
   }
   Closure closure = MakeClosure(robot, stamp_ns, recognition, *target);
-  Evidence evidence;
+  Evidence& evidence = closure.evidence;
   evidence.inliers = recognition.inliers.size();
   evidence.runner_up = recognition.runner_up_size;
   evidence.since_twin_m = robots_[robot].path_m - robots_[robot].twin_path_m;
@@ -460,7 +460,6 @@ std::optional<Closure> BackEnd::Verify(RobotIndex robot, StampNs stamp_ns, const
       counts->end = StepEnd::kNotRefined;
       return std::nullopt;
     }
-    evidence.overlap = closure.evidence.overlap;
   }
   MeasureCoverage(robot, closure.T_map_odom, &evidence);
   MeasureContradiction(robot, *target, closure, &evidence);
@@ -470,7 +469,6 @@ std::optional<Closure> BackEnd::Verify(RobotIndex robot, StampNs stamp_ns, const
   counts->evidence = evidence;
   counts->end = ToStepEnd(Judge(evidence, parameters_.acceptance));
   closure.candidates = result.candidates;
-  closure.evidence = evidence;
   return closure;
 }
 

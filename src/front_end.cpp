@@ -80,7 +80,7 @@ FrontEndStep FrontEnd::Process(const Scan& scan) {
   GroundFilterResult filtered = ground_filter_.Filter(scan.points_sensor, scan.T_odom_sensor);
   timer.Lap("ground_filter");
 
-  const VoxelUpdate left = 
+  const VoxelUpdate left =
       grid_.RemoveOutside(scan.T_odom_sensor.translation(), parameters_.local_radius_m, OldestInsertion());
   timer.Lap("voxel_removal");
   if (normals_) {
@@ -250,7 +250,8 @@ std::vector<LocalPoint> FrontEnd::LocalCloud() const {
 }
 
 std::size_t FrontEnd::memory_bytes() const {
-  return grid_.memory_bytes() + segmenter_->memory_bytes() + trail_finder_.memory_bytes() + (normals_ ? normals_->memory_bytes() : 0);
+  return grid_.memory_bytes() + segmenter_->memory_bytes() + trail_finder_.memory_bytes() +
+         (normals_ ? normals_->memory_bytes() : 0);
 }
 
 }  // namespace incremental_segmatch

@@ -412,6 +412,13 @@ void Validate(const RefinementParameters& parameters) {
     Refuse("floor_rad", parameters.floor_rad, "zero or positive, and finite");
 }
 
+/// Target points of a refinement's points.
+struct Partners {
+  std::vector<std::uint32_t> points;
+  const SurfaceCloud* target = nullptr;  ///< where they are
+  double moved_m = 0.0;                  ///< by which the points have moved since they were found
+};
+
 /// Relative to its own center, as the local cloud is to its own: floats and normal equations are good at small numbers.
 struct RefinementTarget::Impl {
   Impl(const std::vector<Eigen::Vector3d>& points, const RefinementParameters& parameters)
@@ -422,18 +429,14 @@ struct RefinementTarget::Impl {
         coarse(CellHash(fine.cells().points(), static_cast<float>(parameters.min_distance_m)).CellMeans(),
                static_cast<float>(parameters.max_distance_m)) {}
 
-  /// Partners are those of the last call as long as they are of the same points and these have hardly moved since.
-  System BuildSystem(const std::vector<Eigen::Vector3f>& local, const Pose& T, double width_m, double moved_m) {
+  /// Partners stay as long as they are of the same points and these have hardly moved since.
+  System BuildSystem(const std::vector<Eigen::Vector3f>& local, const Pose& T, double width_m, Partners* partners) {
     SurfaceCloud* const target = width_m <= parameters.min_distance_m ? &fine : &coarse;
     const float distance = static_cast<float>(std::max(width_m, parameters.min_distance_m));
-    moved_since_m += moved_m;
     const double spacing_m = (target == &fine ? kFineSpacing : 1.0) * parameters.min_distance_m;
-    if (target != searched || partners.size() != local.size() || moved_since_m > kStale * spacing_m) {
-      partners = FindPartners(local, T, target->cells(), distance);
-      searched = target;
-      moved_since_m = 0.0;
-    }
-    return incremental_segmatch::BuildSystem(local, partners, T, target, fine.cells(),
+    if (target != partners->target || partners->points.size() != local.size() || partners->moved_m > kStale * spacing_m)
+      *partners = {FindPartners(local, T, target->cells(), distance), target, 0.0};
+    return incremental_segmatch::BuildSystem(local, partners->points, T, target, fine.cells(),
                                              static_cast<float>(parameters.normal_radius_m), distance, width_m);
   }
 
@@ -441,9 +444,6 @@ struct RefinementTarget::Impl {
   Eigen::Vector3d center;
   SurfaceCloud fine;
   SurfaceCloud coarse;
-  std::vector<std::uint32_t> partners;       ///< of the running refinement's points
-  const SurfaceCloud* searched = nullptr;    ///< where they are
-  double moved_since_m = 0.0;
 };
 
 RefinementTarget::RefinementTarget(const std::vector<Eigen::Vector3d>& points_target,
@@ -468,20 +468,19 @@ std::optional<RefinedTransform> RefinementTarget::Refine(const std::vector<Eigen
   const double last_width_m = kFineWidth * parameters.min_distance_m;
   double width_m = parameters.max_distance_m;
   System system;
-  double moved_m = 0.0;
+  Partners partners;
   bool converged = false;
-  impl_->searched = nullptr;
   for (int iteration = 0; iteration < parameters.max_iterations && !converged; ++iteration) {
     const bool is_last = width_m == last_width_m;
-    system = impl_->BuildSystem(is_last ? local : coarse_local, T, width_m, moved_m);
+    system = impl_->BuildSystem(is_last ? local : coarse_local, T, width_m, &partners);
     if (system.pairs < kMinPairs) return std::nullopt;
     const auto [step, length_m] = Directions(system, parameters.min_stiffness).Step(system.gradient);
     T = Perturb(step, T);
-    moved_m = length_m;
+    partners.moved_m += length_m;
     converged = is_last && length_m < kConvergedM;
     width_m = std::max(last_width_m, (length_m < kSettled * width_m ? kSettledShrink : kShrink) * width_m);
   }
-  if (!converged) system = impl_->BuildSystem(local, T, last_width_m, moved_m);
+  if (!converged) system = impl_->BuildSystem(local, T, last_width_m, &partners);
 
   RefinedTransform refined;
   refined.overlap = static_cast<double>(system.pairs) / static_cast<double>(local.size());

@@ -195,11 +195,7 @@ std::map<std::string, std::size_t> CountEnds(const std::vector<StepRecord>& step
 }
 
 std::vector<double> PathLengths(const EvaluationResult& result) {
-  const std::vector<Pose> poses = result.truth ? result.truth->T_world_sensor : PosesOf(result.odometry);
-  std::vector<double> path_m(poses.size(), 0.0);
-  for (std::size_t i = 1; i < poses.size(); ++i)
-    path_m[i] = path_m[i - 1] + (poses[i].translation() - poses[i - 1].translation()).norm();
-  return path_m;
+  return PathLengths(result.truth ? result.truth->T_world_sensor : PosesOf(result.odometry));
 }
 
 double Mean(const std::vector<double>& values) {

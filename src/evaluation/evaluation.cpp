@@ -45,13 +45,6 @@ ClosureRow ToRow(const Closure& closure) {
           closure.T_target_query, closure.inliers,         closure.candidates,  closure.rms_m};
 }
 
-// Step of the drive at a stamp that the back end gave back.
-std::size_t StepAt(const std::vector<StampedPose>& odometry, StampNs stamp_ns) {
-  const auto it = std::lower_bound(odometry.begin(), odometry.end(), stamp_ns,
-                                   [](const StampedPose& pose, StampNs stamp) { return pose.stamp_ns < stamp; });
-  return static_cast<std::size_t>(it - odometry.begin());
-}
-
 // Feeds the pose graph and the corrections that come of it; knows when it is time for either.
 class LoopCloser {
  public:

@@ -1,12 +1,12 @@
 #include "evaluation/kidnap_comparison.hpp"
 
-#include <algorithm>
 #include <cmath>
-#include <cstdio>
 #include <nlohmann/json.hpp>
 #include <stdexcept>
 
 #include "evaluation/analysis.hpp"
+#include "evaluation/svg.hpp"
+#include "evaluation/trajectory_error.hpp"
 
 namespace incremental_segmatch {
 namespace {
@@ -15,25 +15,10 @@ using Json = nlohmann::ordered_json;
 
 constexpr double kDegPerRad = 180.0 / M_PI;
 
-std::size_t StepAt(const EvaluationResult& result, StampNs stamp_ns) {
-  const auto it = std::lower_bound(result.odometry.begin(), result.odometry.end(), stamp_ns,
-                                   [](const StampedPose& pose, StampNs stamp) { return pose.stamp_ns < stamp; });
-  if (it == result.odometry.end() || it->stamp_ns != stamp_ns)
-    throw std::invalid_argument("a closure's stamp is no scan's");
-  return static_cast<std::size_t>(it - result.odometry.begin());
-}
-
 std::vector<const ClosureRow*> ByStep(const EvaluationResult& result) {
   std::vector<const ClosureRow*> rows(result.odometry.size(), nullptr);
-  for (const ClosureRow& row : result.closures) rows[StepAt(result, row.stamp_query_ns)] = &row;
+  for (const ClosureRow& row : result.closures) rows[StepAt(result.odometry, row.stamp_query_ns)] = &row;
   return rows;
-}
-
-std::string Number(double value, const char* format) {
-  if (std::isnan(value)) return "–";
-  char text[64];
-  std::snprintf(text, sizeof text, format, value);
-  return text;
 }
 
 }  // namespace
@@ -50,14 +35,14 @@ KidnapComparison CompareKidnapped(const std::string& drive, const EvaluationResu
   const std::vector<const ClosureRow*> expected = ByStep(undisturbed), found = ByStep(carried);
   const std::vector<double> path_m = PathLengths(undisturbed);
   const auto target_in_odom = [&](const ClosureRow& row) -> const Pose& {
-    return undisturbed.odometry[StepAt(undisturbed, row.stamp_target_ns)].T_frame_sensor;
+    return undisturbed.odometry[StepAt(undisturbed.odometry, row.stamp_target_ns)].T_frame_sensor;
   };
 
   KidnapComparison comparison;
   comparison.drive = drive;
   comparison.false_undisturbed = undisturbed.score->false_closures;
   comparison.false_carried = carried.score->false_closures;
-  comparison.parts = {{"before"}, {"after, within " + Number(refill_m, "%.0f m")}, {"after that"}};
+  comparison.parts = {{"before"}, {"after, within " + FormatNumber(refill_m, "%.0f m")}, {"after that"}};
   std::vector<std::vector<double>> differences_m(comparison.parts.size()), differences_deg(comparison.parts.size());
   for (std::size_t i = 0; i < steps; ++i) {
     const std::size_t which = i < first_moved ? 0 : path_m[i] - path_m[first_moved] <= refill_m ? 1 : 2;
@@ -89,8 +74,8 @@ std::string KidnapMarkdown(const std::vector<KidnapComparison>& comparisons) {
     for (const KidnapPart& part : comparison.parts) {
       text += "| " + comparison.drive + " | " + part.name + " | " + std::to_string(part.steps) + " | " +
               std::to_string(part.undisturbed) + " | " + std::to_string(part.carried) + " | " +
-              std::to_string(part.both) + " | " + Number(part.difference_95_m, "%.3f m") + " | " +
-              Number(part.difference_max_m, "%.3f m") + ", " + Number(part.difference_max_deg, "%.2f°") + " | " +
+              std::to_string(part.both) + " | " + FormatNumber(part.difference_95_m, "%.3f m") + " | " +
+              FormatNumber(part.difference_max_m, "%.3f m") + ", " + FormatNumber(part.difference_max_deg, "%.2f°") + " | " +
               std::to_string(comparison.false_undisturbed) + ", " + std::to_string(comparison.false_carried) + " |\n";
     }
   }

@@ -94,21 +94,23 @@ void WriteMissedCsv(const EvaluationResult& result, const std::string& path) {
   if (!file) throw std::runtime_error("can't write " + path);
   file << "step,stamp,direction,since_m,nearest_old_step,cause,segments,candidates,edges,clique,clique_needed,"
           "seen_before,open,candidates_true\n";
+  // How many of a step's local segments were seen before, and how many of them passed which stage.
+  struct Seen {
+    std::size_t before = 0, open = 0, candidates = 0;
+  };
+  std::vector<Seen> seen(result.steps.size());
+  for (const TruePair& pair : result.true_pairs) {
+    ++seen[pair.step].before;
+    seen[pair.step].open += pair.allowed;
+    seen[pair.step].candidates += pair.within;
+  }
   for (const MissedRevisit& miss : FindMissedRevisits(result)) {
     const StepRecord& step = result.steps[miss.step];
     file << miss.step << ',' << FormatSeconds(step.stamp_ns) << ',' << (miss.opposite ? "opposite" : "same") << ','
          << miss.since_m << ',' << miss.target_step << ',' << miss.cause << ',' << step.front_end.clusters.segments
          << ',' << step.back_end.candidates << ',' << step.back_end.edges << ',' << step.back_end.clique << ','
-         << result.min_clique;
-    // How many of the local segments were seen before, and which stage lost them.
-    std::size_t seen_before = 0, open = 0, candidates = 0;
-    for (const TruePair& pair : result.true_pairs) {
-      if (pair.step != miss.step) continue;
-      ++seen_before;
-      open += pair.allowed;
-      candidates += pair.within;
-    }
-    file << ',' << seen_before << ',' << open << ',' << candidates << '\n';
+         << result.min_clique << ',' << seen[miss.step].before << ',' << seen[miss.step].open << ','
+         << seen[miss.step].candidates << '\n';
   }
   file.close();
   if (!file) throw std::runtime_error("writing " + path + " failed: is the disk full?");

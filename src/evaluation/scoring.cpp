@@ -21,13 +21,10 @@ double Ratio(std::size_t part, std::size_t whole) {
 // The true drive: seconds, positions and path lengths per step.
 class Truth {
  public:
-  explicit Truth(const TrueTrajectory& drive) : poses_(drive.T_world_sensor) {
+  explicit Truth(const TrueTrajectory& drive) : poses_(drive.T_world_sensor), path_m_(PathLengths(poses_)) {
     if (drive.stamps_ns.size() != poses_.size())
       throw std::invalid_argument("scoring needs one true pose for each stamp");
-    for (std::size_t i = 0; i < poses_.size(); ++i) {
-      seconds_.push_back(static_cast<double>(drive.stamps_ns[i]) / 1e9);
-      path_m_.push_back(i == 0 ? 0.0 : path_m_[i - 1] + (position(i) - position(i - 1)).norm());
-    }
+    for (const StampNs stamp_ns : drive.stamps_ns) seconds_.push_back(static_cast<double>(stamp_ns) / 1e9);
     std::vector<double> periods;
     for (std::size_t i = 1; i < seconds_.size(); ++i) periods.push_back(seconds_[i] - seconds_[i - 1]);
     if (!periods.empty()) half_period_s_ = 0.5 * Percentile(periods, 0.5);
@@ -55,8 +52,8 @@ class Truth {
 
  private:
   const std::vector<Pose>& poses_;
-  std::vector<double> seconds_;
   std::vector<double> path_m_;
+  std::vector<double> seconds_;
   double half_period_s_ = 0.05;
 };
 
@@ -227,6 +224,13 @@ Score ScoreLocalizations(const TrueTrajectory& drive, const TrueTrajectory& map_
                          const std::vector<ClosureRow>& closures, const ScoringParameters& parameters) {
   const Truth truth(drive), map_truth(map_drive);
   return ScoreAgainst(truth, Targets(truth, map_truth, parameters), closures, parameters);
+}
+
+std::vector<double> PathLengths(const std::vector<Pose>& poses) {
+  std::vector<double> path_m(poses.size(), 0.0);
+  for (std::size_t i = 1; i < poses.size(); ++i)
+    path_m[i] = path_m[i - 1] + (poses[i].translation() - poses[i - 1].translation()).norm();
+  return path_m;
 }
 
 void WriteClosuresCsv(const std::vector<ClosureRow>& closures, const std::string& path) {

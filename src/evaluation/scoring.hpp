@@ -32,6 +32,9 @@ struct TrueTrajectory {
   std::vector<Pose> T_world_sensor;  ///< one for each stamp
 };
 
+/// Path from the first pose on, at each pose (m).
+std::vector<double> PathLengths(const std::vector<Pose>& poses);
+
 /// The terms of the score.
 struct ScoringParameters {
   double min_age_s = 60.0;         ///< a closure's target is more than this older than its query

@@ -1,6 +1,7 @@
 #include "trajectory_error.hpp"
 
 #include <Eigen/Geometry>
+#include <algorithm>
 #include <cmath>
 #include <limits>
 #include <stdexcept>
@@ -33,6 +34,14 @@ std::vector<Pose> PosesOf(const std::vector<StampedPose>& trajectory) {
   poses.reserve(trajectory.size());
   for (const StampedPose& pose : trajectory) poses.push_back(pose.T_frame_sensor);
   return poses;
+}
+
+std::size_t StepAt(const std::vector<StampedPose>& trajectory, StampNs stamp_ns) {
+  const auto it = std::lower_bound(trajectory.begin(), trajectory.end(), stamp_ns,
+                                   [](const StampedPose& pose, StampNs stamp) { return pose.stamp_ns < stamp; });
+  if (it == trajectory.end() || it->stamp_ns != stamp_ns)
+    throw std::invalid_argument("a closure's stamp is no scan's");
+  return static_cast<std::size_t>(it - trajectory.begin());
 }
 
 std::vector<StampedPose> OptimizeWithTrueClosures(const std::vector<StampNs>& stamps_ns,

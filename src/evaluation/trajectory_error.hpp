@@ -20,6 +20,8 @@ double AbsoluteTrajectoryError(const std::vector<Pose>& estimate, const std::vec
 
 /// Poses without their stamps.
 std::vector<Pose> PosesOf(const std::vector<StampedPose>& trajectory);
+/// Step of the drive whose scan has a stamp. Throws std::invalid_argument if none has. O(log steps).
+std::size_t StepAt(const std::vector<StampedPose>& trajectory, StampNs stamp_ns);
 
 /// A closure that went into the graph, by steps of the drive.
 struct GraphClosure {

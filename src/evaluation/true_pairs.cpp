@@ -14,15 +14,6 @@ std::size_t IndexOf(const TrueTrajectory& truth, StampNs stamp_ns) {
   return static_cast<std::size_t>(it - truth.stamps_ns.begin());
 }
 
-std::vector<double> PathOf(const TrueTrajectory& truth) {
-  std::vector<double> path_m(truth.T_world_sensor.size(), 0.0);
-  for (std::size_t i = 1; i < path_m.size(); ++i) {
-    path_m[i] =
-        path_m[i - 1] + (truth.T_world_sensor[i].translation() - truth.T_world_sensor[i - 1].translation()).norm();
-  }
-  return path_m;
-}
-
 // A view where the truth has it.
 struct PlacedView {
   SegmentKey segment;
@@ -67,7 +58,7 @@ TruePairFinder::TruePairFinder(const TrueTrajectory& truth, const TrueTrajectory
       revisit_targets_((map_truth != nullptr ? ScoreLocalizations(truth, *map_truth, {}, scoring)
                                              : ScoreClosures(truth, {}, scoring))
                            .revisit_targets),
-      path_m_(PathOf(truth)) {}
+      path_m_(PathLengths(truth.T_world_sensor)) {}
 
 void TruePairFinder::Apply(std::size_t step, const SegmentDelta& delta) {
   if (delta.full_state) local_.clear();

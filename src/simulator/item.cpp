@@ -355,10 +355,10 @@ Primitives BuildPedestrian(const Item& item) {
       Primitive::Cylinder({0, 0, 0.84f * height}, {0, 0, height}, 0.1f, Material::kCloth)};
 }
 
-Primitives BuildPartition(const Item& item) {
+Primitives BuildBlock(const Item& item, Material material) {
   const Vector2f half = item.footprint.half_m.cast<float>();
   const float height = static_cast<float>(item.height_m);
-  return {Primitive::Box({0, 0, 0.5f * height}, {half.x(), half.y(), 0.5f * height}, Material::kPlaster)};
+  return {Primitive::Box({0, 0, 0.5f * height}, {half.x(), half.y(), 0.5f * height}, material)};
 }
 
 // Table top, sides, perhaps drawers, perhaps screens.
@@ -385,12 +385,6 @@ Primitives BuildDesk(const Item& item) {
         {0.03f, 0.27f, 0.2f}, Material::kMetal));
   }
   return out;
-}
-
-Primitives BuildCabinet(const Item& item) {
-  const Vector2f half = item.footprint.half_m.cast<float>();
-  const float height = static_cast<float>(item.height_m);
-  return {Primitive::Box({0, 0, 0.5f * height}, {half.x(), half.y(), 0.5f * height}, Material::kWood)};
 }
 
 Primitives BuildPottedPlant(const Item& item) {
@@ -454,11 +448,11 @@ std::vector<Primitive> BuildItem(const Item& item) {
       return BuildPedestrian(item);
     case ItemKind::kPartition:
     case ItemKind::kPillar:
-      return BuildPartition(item);
+      return BuildBlock(item, Material::kPlaster);
     case ItemKind::kDesk:
       return BuildDesk(item);
     case ItemKind::kCabinet:
-      return BuildCabinet(item);
+      return BuildBlock(item, Material::kWood);
     case ItemKind::kPottedPlant:
       return BuildPottedPlant(item);
     case ItemKind::kCeiling:
