@@ -68,6 +68,7 @@ BackEndNodelet::~BackEndNodelet() {
   load_service_.shutdown();
   reset_service_.shutdown();
   trigger_service_.shutdown();
+  service_spinner_.stop();
   diagnostics_timer_.stop();
   tuning_.reset();
   worker_.reset();
@@ -110,18 +111,23 @@ void BackEndNodelet::Start() {
       NODELET_FATAL("the back end does not start: %s", error.what());
     }
   });
-  save_service_ = nh.advertiseService("save_map", &BackEndNodelet::OnSaveMap, this);
-  load_service_ = nh.advertiseService("load_map", &BackEndNodelet::OnLoadMap, this);
-  reset_service_ = nh.advertiseService("reset", &BackEndNodelet::OnReset, this);
-  trigger_service_ = nh.advertiseService("trigger", &BackEndNodelet::OnTrigger, this);
+  ros::NodeHandle service_nh = nh;
+  service_nh.setCallbackQueue(&service_queue_);
+  save_service_ = service_nh.advertiseService("save_map", &BackEndNodelet::OnSaveMap, this);
+  load_service_ = service_nh.advertiseService("load_map", &BackEndNodelet::OnLoadMap, this);
+  reset_service_ = service_nh.advertiseService("reset", &BackEndNodelet::OnReset, this);
+  trigger_service_ = service_nh.advertiseService("trigger", &BackEndNodelet::OnTrigger, this);
   if (parameters_.robots.empty()) Subscribe("");
   for (const std::string& robot : parameters_.robots) Subscribe(robot);
   const boost::function<void(const geometry_msgs::PointStampedConstPtr&)> on_point =
       [this](const geometry_msgs::PointStampedConstPtr& m) { worker_->PostAlways([this, m] { Select(*m); }); };
   subscribers_.push_back(nh.subscribe<geometry_msgs::PointStamped>("clicked_point", 1, on_point));
+  ros::NodeHandle tuning_nh = getPrivateNodeHandle();
+  tuning_nh.setCallbackQueue(&service_queue_);
   tuning_ = std::make_unique<Tuning<BackEndConfig>>(
-      getPrivateNodeHandle(), ToConfig(parameters),
+      tuning_nh, ToConfig(parameters),
       [this](const BackEndConfig& config) { worker_->Run([this, &config] { Change(config); }); });
+  service_spinner_.start();
 
   diagnostics_ = std::make_unique<diagnostic_updater::Updater>(nh, getPrivateNodeHandle(), getName());
   diagnostics_->setHardwareID("none");

@@ -9,6 +9,7 @@
 #include <nav_msgs/Odometry.h>
 #include <nav_msgs/Path.h>
 #include <nodelet/nodelet.h>
+#include <ros/callback_queue.h>
 #include <ros/ros.h>
 #include <std_srvs/Trigger.h>
 #include <tf2_ros/transform_broadcaster.h>
@@ -127,6 +128,11 @@ class BackEndNodelet : public nodelet::Nodelet {
   BackEndNodeParameters parameters_;   // what may change, the worker's thread changes
   BackEndParameters core_parameters_;  // likewise
   Throttle throttle_;
+
+  // Services wait for the worker, which may be waiting for the front end's. In a thread of their own, so that they take none
+  // of the manager's from the front end: on one core it has one.
+  ros::CallbackQueue service_queue_;
+  ros::AsyncSpinner service_spinner_{1, &service_queue_};
 
   std::vector<ros::Subscriber> subscribers_;
   std::vector<std::string> segments_topics_;

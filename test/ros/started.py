@@ -91,7 +91,7 @@ def presets(source, folder):
             expect_answers("/" + file.stem, file.name)
             print("%s: front end, back end and pose graph have started" % file.name)
     said = (folder / "launch.txt").read_text()
-    if "FATAL" in said:
+    if "FATAL" in said or "terminate called" in said:
         sys.exit(said)
 
 
