@@ -2,12 +2,12 @@
 
 #include <algorithm>
 #include <array>
-#include <chrono>
 #include <cmath>
 #include <stdexcept>
 #include <string>
 #include <tuple>
 
+#include "incremental_segmatch/stage_times.hpp"
 #include "radix_sort.hpp"
 
 #if defined(__GNUC__) && defined(__x86_64__)
@@ -779,10 +779,9 @@ class ConsistencyGraphBuilder::Impl {
 
 ConsistencyGraph ConsistencyGraphBuilder::Impl::BuildWithFastest(const Correspondences& correspondences) {
   const ConsistencyMethod method = chooser_.Next(correspondences.size());
-  const auto start = std::chrono::steady_clock::now();
+  const double start_ms = ThreadCpuMs();
   ConsistencyGraph graph = BuildWith(method, correspondences);
-  const std::chrono::duration<double> seconds = std::chrono::steady_clock::now() - start;
-  chooser_.Report(method, seconds.count() / static_cast<double>(correspondences.size() + 1));
+  chooser_.Report(method, (ThreadCpuMs() - start_ms) / static_cast<double>(correspondences.size() + 1));
   return graph;
 }
 

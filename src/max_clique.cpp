@@ -85,22 +85,46 @@ class BitGraph {
   std::vector<Word> bits_;
 };
 
+/// What a search has spent, and whether it has to end: 64-bit words of bit sets and neighbours looked at, and time.
+class Effort {
+ public:
+  Effort(std::uint64_t limit, Clock::time_point deadline) : limit_(limit), deadline_(deadline) {}
+
+  void Spend(std::uint64_t work) { spent_ += work; }
+  std::uint64_t spent() const { return spent_; }
+
+  bool IsExhausted() {
+    constexpr std::uint64_t kBetweenLooksAtTheClock = 1 << 14;
+    if (spent_ >= next_look_) {
+      next_look_ = spent_ + kBetweenLooksAtTheClock;
+      is_late_ = is_late_ || Clock::now() >= deadline_;
+    }
+    return is_late_ || spent_ > limit_;
+  }
+
+ private:
+  std::uint64_t limit_;
+  Clock::time_point deadline_;
+  std::uint64_t spent_ = 0;
+  std::uint64_t next_look_ = 0;
+  bool is_late_ = false;
+};
+
 /// Branch and bound in the neighbourhood of one vertex: cliques of more than `floor` vertices.
 class Search {
  public:
   /// Called with each clique that is large enough (indices into the bit graph); returns the new floor.
   using Report = std::function<std::size_t(const Vertices&)>;
-  /// Called now and then with the words touched since; true to stop.
-  using Stop = std::function<bool(std::uint64_t)>;
 
-  Search(const BitGraph& graph, std::size_t vertices, std::size_t floor, const Report& report, const Stop& stop)
-      : graph_(graph), words_(graph.words()), floor_(floor), report_(report), stop_(stop) {
+  Search(const BitGraph& graph, std::size_t vertices, std::size_t floor, const Report& report, Effort* effort)
+      : graph_(graph), words_(graph.words()), floor_(floor), report_(report), effort_(*effort) {
     std::vector<Word> all(words_, 0);
     for (std::size_t v = 0; v < vertices; ++v) Set(all.data(), v);
     Expand(all.data());
   }
 
-  bool stopped() const { return stopped_; }
+  /// False if the effort was exhausted before the end.
+  bool is_complete() const { return is_complete_; }
 
  private:
   struct Coloured {
@@ -120,9 +144,8 @@ class Search {
   const std::size_t words_;
   std::size_t floor_;
   const Report& report_;
-  const Stop& stop_;
-  bool stopped_ = false;
-  std::uint64_t work_ = 0;
+  Effort& effort_;
+  bool is_complete_ = true;
   Vertices clique_;
   std::vector<Word> classes_;  ///< colour classes of the colouring under way, scratch
 };
@@ -150,7 +173,7 @@ std::vector<Search::Coloured> Search::Colour(const Word* candidates) {
         Clear(available.data(), v);
         if (colour >= needed && Recolour(v, needed)) continue;
         for (std::size_t k = w; k < words_; ++k) available[k] &= ~row[k];
-        work_ += words_ - w;
+        effort_.Spend(words_ - w);
         Set(ColourClass(colour), v);
         empty = false;
         if (colour >= needed)
@@ -174,14 +197,14 @@ bool Search::Recolour(std::size_t vertex, std::size_t classes) {
       neighbours += static_cast<std::size_t>(__builtin_popcountll(common));
       only = k * kWordBits + LowestBit(common);
     }
-    work_ += words_;
+    effort_.Spend(words_);
     if (neighbours != 1) continue;
     const Word* const row_of_only = graph_.row(only);
     for (std::size_t b = a + 1; b < classes; ++b) {
       Word* const class_b = ColourClass(b);
       bool disjoint = true;
       for (std::size_t k = 0; k < words_ && disjoint; ++k) disjoint = (class_b[k] & row_of_only[k]) == 0;
-      work_ += words_;
+      effort_.Spend(words_);
       if (!disjoint) continue;
       Clear(class_a, only);
       Set(class_a, vertex);
@@ -193,17 +216,16 @@ bool Search::Recolour(std::size_t vertex, std::size_t classes) {
 }
 
 void Search::Expand(Word* candidates) {
-  constexpr std::uint64_t kWorkBetweenStops = 1 << 14;
-  if (work_ >= kWorkBetweenStops) stopped_ = stop_(std::exchange(work_, 0));
-  if (stopped_) return;
+  if (effort_.IsExhausted()) is_complete_ = false;
+  if (!is_complete_) return;
   const std::vector<Coloured> branches = Colour(candidates);
   std::vector<Word> next(words_);
-  for (auto branch = branches.rbegin(); branch != branches.rend() && !stopped_; ++branch) {
+  for (auto branch = branches.rbegin(); branch != branches.rend() && is_complete_; ++branch) {
     if (clique_.size() + branch->bound <= floor_) return;
     const Word* const row = graph_.row(branch->vertex);
     Word any = 0;
     for (std::size_t k = 0; k < words_; ++k) any |= next[k] = candidates[k] & row[k];
-    work_ += words_;
+    effort_.Spend(words_);
     clique_.push_back(branch->vertex);
     if (any != 0) {
       Expand(next.data());
@@ -378,6 +400,7 @@ class Finder {
   Finder(const ConsistencyGraph& graph, const MaxCliqueParameters& parameters, const CliqueOrder& better)
       : parameters_(parameters),
         better_(better),
+        effort_(parameters.max_work, Clock::now() + parameters.deadline),
         reduced_(graph),
         floor_(parameters.min_size - 1) {}
 
@@ -390,13 +413,13 @@ class Finder {
   void KeepCliquesOf(std::size_t size);
   bool Maximize();
   void CompareTies();
-  Vertices Members(std::uint32_t v, std::size_t floor);
-  bool SearchFrom(std::uint32_t v, std::size_t floor, const Report& report, const Search::Stop& stop);
+  Vertices Members(std::uint32_t v, std::size_t floor, Effort* effort);
+  bool SearchFrom(std::uint32_t v, std::size_t floor, const Report& report, Effort* effort);
   Vertices Named(const Vertices& clique) const;
 
-  const Clock::time_point start_ = Clock::now();
   const MaxCliqueParameters& parameters_;
   const CliqueOrder& better_;
+  Effort effort_;             ///< of the search for the maximum
   ConsistencyGraph reduced_;  ///< the given one, without what can't matter any more
   CoreGraph graph_;           ///< of it
   Vertices best_;      ///< incumbent in the original graph, sorted
@@ -427,12 +450,13 @@ void Finder::GrowGreedily() {
   std::partial_sort(starts.begin(), starts.begin() + static_cast<std::ptrdiff_t>(count), starts.end(), before);
   starts.resize(count);
   for (const std::uint32_t start : starts) {
-    if (reduced_.Neighbours(start).size() < floor_ || Clock::now() - start_ >= parameters_.deadline) return;
+    if (reduced_.Neighbours(start).size() < floor_ || effort_.IsExhausted()) return;
     Vertices candidates(reduced_.Neighbours(start).begin(), reduced_.Neighbours(start).end());
     Vertices clique{start};
     while (!candidates.empty() && clique.size() + candidates.size() > floor_) {
       clique.push_back(*std::min_element(candidates.begin(), candidates.end(), before));
       const ConsistencyGraph::Range all = reduced_.Neighbours(clique.back());
+      effort_.Spend(candidates.size() + all.size());
       Vertices common;
       std::set_intersection(candidates.begin(), candidates.end(), all.begin(), all.end(), std::back_inserter(common));
       candidates.swap(common);
@@ -453,7 +477,7 @@ void Finder::KeepCliquesOf(std::size_t size) {
 
 /// Later neighbours of v that may be with it in a clique of more than `floor` vertices: each has at least floor - 1
 /// neighbours among them. High degrees first, as colouring wants them.
-Vertices Finder::Members(std::uint32_t v, std::size_t floor) {
+Vertices Finder::Members(std::uint32_t v, std::size_t floor, Effort* effort) {
   Vertices members;
   for (const std::uint32_t u : graph_.LaterNeighbours(v)) {
     if (graph_.core(u) >= floor) members.push_back(u);
@@ -464,7 +488,9 @@ Vertices Finder::Members(std::uint32_t v, std::size_t floor) {
     for (std::uint32_t i = 0; i < members.size(); ++i) local_index_[members[i]] = i + 1;
     degree.assign(members.size(), 0);
     for (std::size_t i = 0; i < members.size(); ++i) {
-      for (const std::uint32_t u : graph_.LaterNeighbours(members[i])) {
+      const ConsistencyGraph::Range later = graph_.LaterNeighbours(members[i]);
+      effort->Spend(later.size());
+      for (const std::uint32_t u : later) {
         if (local_index_[u] == 0) continue;
         ++degree[i];
         ++degree[local_index_[u] - 1];
@@ -486,9 +512,11 @@ Vertices Finder::Members(std::uint32_t v, std::size_t floor) {
   return by_degree;
 }
 
-/// Searches the later neighbourhood of v for cliques of more than `floor` vertices, v included. False if stopped.
-bool Finder::SearchFrom(std::uint32_t v, std::size_t floor, const Report& report, const Search::Stop& stop) {
-  const Vertices members = Members(v, floor);
+/// Searches the later neighbourhood of v for cliques of more than `floor` vertices, v included. False if the effort
+/// was exhausted.
+bool Finder::SearchFrom(std::uint32_t v, std::size_t floor, const Report& report, Effort* effort) {
+  if (effort->IsExhausted()) return false;
+  const Vertices members = Members(v, floor, effort);
   if (members.empty()) return true;
   bits_.Reset(members.size());
   for (std::uint32_t i = 0; i < members.size(); ++i) local_index_[members[i]] = i + 1;
@@ -506,13 +534,11 @@ bool Finder::SearchFrom(std::uint32_t v, std::size_t floor, const Report& report
     for (const std::uint32_t i : clique) vertices.push_back(members[i]);
     return report(Named(vertices)) - 1;  // v is not among the bit graph's vertices
   };
-  return !Search(bits_, members.size(), floor - 1, report_members, stop).stopped();
+  return Search(bits_, members.size(), floor - 1, report_members, effort).is_complete();
 }
 
-/// Raises the incumbent to a maximum clique; false if the deadline passed before that was proven.
+/// Raises the incumbent to a maximum clique; false if the effort was exhausted before that was proven.
 bool Finder::Maximize() {
-  const auto late = [&] { return Clock::now() - start_ >= parameters_.deadline; };
-  const Search::Stop stop = [&](std::uint64_t) { return late(); };
   const Report report = [&](Vertices clique) {
     floor_ = clique.size();
     best_ = std::move(clique);
@@ -521,7 +547,7 @@ bool Finder::Maximize() {
   result_.upper_bound = floor_;
   for (std::uint32_t v = 0; v < graph_.size(); ++v) {
     if (graph_.core(v) < floor_) continue;
-    if (!late() && SearchFrom(v, floor_, report, stop)) continue;
+    if (SearchFrom(v, floor_, report, &effort_)) continue;
     // What is left lies in a vertex with its later neighbours, no more than the core number.
     for (std::uint32_t u = v; u < graph_.size(); ++u) {
       result_.upper_bound = std::max(result_.upper_bound, graph_.LaterNeighbours(u).size() + 1);
@@ -536,22 +562,17 @@ bool Finder::Maximize() {
 /// Looks through the cliques of the maximum size for the best one, as far as the limits allow.
 void Finder::CompareTies() {
   std::size_t ties = 0;
-  std::uint64_t work = 0;
+  Effort effort(parameters_.max_tie_work, Clock::time_point::max());
   const std::size_t floor = floor_ - 1;
-  const auto spent = [&] { return ties >= parameters_.max_ties || work > parameters_.max_tie_work; };
   const Report report = [&](Vertices clique) {
     ++ties;
     if (better_ ? better_(clique, best_) : clique < best_) best_ = std::move(clique);
     // A clique above the maximum does not exist: asking for one ends the search.
-    return spent() ? graph_.size() : floor;
-  };
-  const Search::Stop stop = [&](std::uint64_t touched) {
-    work += touched;
-    return spent();
+    return ties >= parameters_.max_ties ? graph_.size() : floor;
   };
   for (std::uint32_t v = 0; v < graph_.size(); ++v) {
     if (graph_.core(v) < floor) continue;
-    if (SearchFrom(v, floor, report, stop) && !spent()) continue;
+    if (SearchFrom(v, floor, report, &effort) && ties < parameters_.max_ties) continue;
     result_.all_ties_compared = false;
     return;
   }
@@ -576,6 +597,7 @@ MaxCliqueResult Finder::Find() {
     }
   }
   result_.vertices = std::move(best_);
+  result_.work = effort_.spent();
   return std::move(result_);
 }
 
@@ -584,6 +606,7 @@ MaxCliqueResult Finder::Find() {
 MaxCliqueResult FindMaxClique(const ConsistencyGraph& graph, const MaxCliqueParameters& parameters,
                               const CliqueOrder& better) {
   if (parameters.min_size < 3) throw std::invalid_argument("MaxCliqueParameters: min_size must be at least 3");
+  if (parameters.max_work == 0) throw std::invalid_argument("MaxCliqueParameters: max_work must be positive");
   if (parameters.deadline.count() <= 0) throw std::invalid_argument("MaxCliqueParameters: deadline must be positive");
   if (parameters.max_ties < 1) throw std::invalid_argument("MaxCliqueParameters: max_ties must be at least 1");
   return Finder(graph, parameters, better).Find();

@@ -368,9 +368,6 @@ const std::vector<Parameter>& Table() {
              "also look for the best clique beside the winner: evidence against ambiguity"),
       NUMBER(back_end.recognizer.same_place_m, AtLeast(0),
              "correspondences that fit the recognised transform so well are no rivals of it"),
-      Number(
-          "back_end.recognizer.runner_up_deadline_us",
-          [](auto& p) -> auto& { return p.back_end.recognizer.runner_up_deadline; }, AtLeast(1), "of that search"),
 
       NUMBER(back_end.recognizer.consistency.epsilon_m, Above(0),
              "by how much the distance of two segments may differ between the maps"),
@@ -387,13 +384,16 @@ const std::vector<Parameter>& Table() {
              "use AVX2 on processors that have it; the edges are the same without"),
 
       NUMBER(back_end.recognizer.clique.min_size, AtLeast(3), "fewer consistent pairs of segments are no recognition"),
+      NUMBER(back_end.recognizer.clique.max_work, AtLeast(1),
+             "effort of a search, in 64-bit words and neighbours looked at, after which the largest set found so far is taken: a "
+             "count, so that results repeat"),
       Number(
           "back_end.recognizer.clique.deadline_us",
           [](auto& p) -> auto& { return p.back_end.recognizer.clique.deadline; }, AtLeast(1),
-          "after this time of search the largest set found so far is taken"),
+          "the same as a time, for machines on which that effort takes longer"),
       NUMBER(back_end.recognizer.clique.max_ties, AtLeast(1), "how many maximum sets are compared at most"),
       NUMBER(back_end.recognizer.clique.max_tie_work, AtLeast(0),
-             "effort of looking for further maximum sets, in 64-bit words touched: a count, so that results repeat"),
+             "effort of looking for further maximum sets, counted likewise"),
 
       NUMBER(back_end.keyframes.spacing_m, Above(0), "path between key frames, whose scans are kept"),
       NUMBER(back_end.keyframes.submap_radius_m, AtLeast(0),

@@ -3,25 +3,20 @@
 #include <Eigen/Eigenvalues>
 #include <Eigen/LU>
 #include <algorithm>
-#include <chrono>
 #include <cmath>
 #include <stdexcept>
 #include <string>
 #include <tuple>
 #include <utility>
 
+#include "incremental_segmatch/stage_times.hpp"
 #include "incremental_segmatch/twist.hpp"
 #include "radix_sort.hpp"
 
 namespace incremental_segmatch {
 namespace {
 
-using Clock = std::chrono::steady_clock;
 using Vertices = std::vector<std::uint32_t>;
-
-double MillisecondsSince(Clock::time_point start) {
-  return std::chrono::duration<double, std::milli>(Clock::now() - start).count();
-}
 
 std::uint64_t Packed(const SegmentKey& key) {
   return (std::uint64_t{key.robot} << 32) | key.id;
@@ -160,10 +155,8 @@ Vertices Fitting(const Correspondences& correspondences, const Pose& T_target_lo
 
 /// Size of the largest clique among the rest, if it is at least half as large as the winner.
 std::size_t RunnerUpSize(const ConsistencyGraph& graph, std::size_t winner_size, const Vertices& fitting,
-                         std::chrono::microseconds deadline) {
-  MaxCliqueParameters parameters;
+                         MaxCliqueParameters parameters) {
   parameters.min_size = std::max<std::size_t>(3, (winner_size + 1) / 2);
-  parameters.deadline = deadline;
   parameters.max_ties = 1;
   return FindMaxClique(Without(graph, fitting), parameters).vertices.size();
 }
@@ -174,6 +167,7 @@ void Validate(const RecognizerParameters& parameters) {
     if (!good) throw std::invalid_argument(std::string("RecognizerParameters: ") + message);
   };
   require(parameters.clique.min_size >= 3, "clique.min_size must be at least 3");
+  require(parameters.clique.max_work > 0, "clique.max_work must be positive");
   require(parameters.clique.deadline.count() > 0, "clique.deadline must be positive");
   require(parameters.clique.max_ties >= 1, "clique.max_ties must be at least 1");
   require(parameters.max_tilt_rad >= 0.0 && parameters.max_tilt_rad <= kPi, "max_tilt_rad must be in [0, pi]");
@@ -183,7 +177,6 @@ void Validate(const RecognizerParameters& parameters) {
   require(parameters.min_spread_m > 0.0, "min_spread_m must be positive");
   require(parameters.min_sigma_m > 0.0, "min_sigma_m must be positive");
   require(parameters.same_place_m >= 0.0, "same_place_m must not be negative");
-  require(parameters.runner_up_deadline.count() > 0, "runner_up_deadline must be positive");
 }
 
 }  // namespace
@@ -219,22 +212,22 @@ RecognizerResult Recognizer::Recognize(const Correspondences& correspondences) {
   RecognizerResult result;
   result.candidates = correspondences.size();
 
-  const Clock::time_point graph_start = Clock::now();
+  const double graph_start_ms = ThreadCpuMs();
   const Correspondences sorted = SortedCanonically(correspondences);
   const ConsistencyGraph graph = graph_builder_.Build(sorted);  // also of few ones: the cache follows them
   result.edges = graph.edges;
   result.tested_pairs = graph.tested_pairs;
-  result.graph_ms = MillisecondsSince(graph_start);
+  result.graph_ms = ThreadCpuMs() - graph_start_ms;
   if (sorted.size() < parameters_.clique.min_size) return result;
 
-  const Clock::time_point clique_start = Clock::now();
+  const double clique_start_ms = ThreadCpuMs();
   const MaxCliqueResult clique = FindMaxClique(graph, parameters_.clique, SmallerResidual(sorted));
   result.clique_size = clique.vertices.size();
-  result.clique_ms = MillisecondsSince(clique_start);
+  result.clique_ms = ThreadCpuMs() - clique_start_ms;
   result.outcome = RecognitionOutcome::kCliqueTooSmall;
   if (clique.vertices.empty()) return result;
 
-  const Clock::time_point transform_start = Clock::now();
+  const double transform_start_ms = ThreadCpuMs();
   const PointPairs pairs = PointPairsOf(sorted, clique.vertices);
   Recognition recognition;
   recognition.T_target_local = FitTransform(pairs);
@@ -242,7 +235,7 @@ RecognizerResult Recognizer::Recognize(const Correspondences& correspondences) {
   recognition.tilt_rad = TiltOf(recognition.T_target_local);
   recognition.proven_maximum = clique.proven_maximum;
   recognition.max_inliers = clique.upper_bound;
-  result.transform_ms = MillisecondsSince(transform_start);
+  result.transform_ms = ThreadCpuMs() - transform_start_ms;
   result.outcome = RecognitionOutcome::kDegenerate;
   if (std::min(SecondSpread(pairs.local), SecondSpread(pairs.target)) < parameters_.min_spread_m) return result;
   result.outcome = RecognitionOutcome::kTilted;
@@ -257,15 +250,15 @@ RecognizerResult Recognizer::Recognize(const Correspondences& correspondences) {
   }
   recognition.covariance =
       TransformCovariance(moved, CentroidSigma(recognition.rms_m, moved.size(), parameters_.min_sigma_m));
-  result.transform_ms = MillisecondsSince(transform_start);
+  result.transform_ms = ThreadCpuMs() - transform_start_ms;
 
   if (parameters_.find_runner_up) {
-    const Clock::time_point runner_up_start = Clock::now();
+    const double runner_up_start_ms = ThreadCpuMs();
     Vertices fitting = Fitting(sorted, recognition.T_target_local, parameters_.same_place_m);
     fitting.insert(fitting.end(), clique.vertices.begin(), clique.vertices.end());
     recognition.runner_up_size =
-        RunnerUpSize(graph, clique.vertices.size(), fitting, parameters_.runner_up_deadline);
-    result.clique_ms += MillisecondsSince(runner_up_start);
+        RunnerUpSize(graph, clique.vertices.size(), fitting, parameters_.clique);
+    result.clique_ms += ThreadCpuMs() - runner_up_start_ms;
   }
   result.outcome = RecognitionOutcome::kAccepted;
   result.recognition = std::move(recognition);

@@ -2,7 +2,6 @@
 /// Correspondences to a recognition with its evidence (METHOD 5; thesis 3.4).
 #pragma once
 
-#include <chrono>
 #include <optional>
 #include <vector>
 
@@ -14,14 +13,13 @@ namespace incremental_segmatch {
 /// When a set of correspondences is a place.
 struct RecognizerParameters {
   ConsistencyParameters consistency;  ///< its max_vertical_slope must be at least max_tilt_rad
-  MaxCliqueParameters clique;         ///< of the search for the largest consistent set
+  MaxCliqueParameters clique;         ///< of the searches for the largest consistent set and for the best beside it
   double max_tilt_rad = 0.1;          ///< between the two gravity-aligned maps; refuses mirrored fits; 0 to pi
   double max_rms_m = 0.4;             ///< residual of the fit over all inliers, > 0
   double min_spread_m = 1.0;          ///< second largest standard deviation of the inlier centroids; refuses lines; > 0
   double min_sigma_m = 0.05;          ///< floor of a centroid's standard deviation per axis in the covariance, > 0
   bool find_runner_up = true;         ///< also look for the best clique beside the winner: evidence against ambiguity
   double same_place_m = 2.0;          ///< correspondences that fit the winner's transform so well are no rivals of it
-  std::chrono::microseconds runner_up_deadline{20000};  ///< of that search, > 0
 };
 
 /// Why there was no recognition, or that there was one.
@@ -36,11 +34,11 @@ struct Recognition {
   std::vector<Correspondence> inliers;  ///< sorted by (local, target)
   double rms_m = 0.0;                   ///< root mean square distance of the inliers after the fit
   double tilt_rad = 0.0;                ///< angle between the z axes of the two maps
-  bool proven_maximum = true;           ///< false if the deadline ended the search for a larger clique
+  bool proven_maximum = true;           ///< false if the search for a larger clique was cut short
   std::size_t max_inliers = 0;          ///< no clique is larger than this; inliers.size() if proven
   /// Size of the largest clique that shares no correspondence with the inliers, nor has any that fits their transform:
   /// near inliers.size() means that another place is as likely. 0 if it is smaller than 3 or than half of the inliers, or not looked for. A lower bound if
-  /// runner_up_deadline ended the search.
+  /// the search for it was as long as that for the inliers may be.
   std::size_t runner_up_size = 0;
 };
 
@@ -52,7 +50,7 @@ struct RecognizerResult {
   std::size_t edges = 0;                                               ///< consistent pairs
   std::uint64_t tested_pairs = 0;                                      ///< pairs tested for consistency
   std::size_t clique_size = 0;  ///< of the best clique found, 0 below the smallest acceptable size
-  double graph_ms = 0.0;        ///< time for the consistency graph
+  double graph_ms = 0.0;        ///< time for the consistency graph (these three: CPU time of the thread)
   double clique_ms = 0.0;       ///< including the search for the runner-up
   double transform_ms = 0.0;    ///< time for the transform and its tests
 };

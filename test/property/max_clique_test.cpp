@@ -14,12 +14,15 @@ namespace {
 using Vertices = std::vector<std::uint32_t>;
 using Edges = std::vector<ConsistencyGraph::Edge>;
 
-constexpr std::chrono::seconds kNoDeadline{1000};
+constexpr std::uint64_t kUnlimited = std::uint64_t{1} << 60;
 
-MaxCliqueParameters Parameters(std::size_t min_size, std::chrono::microseconds deadline = kNoDeadline) {
+/// Searches to the end, however long that takes.
+MaxCliqueParameters Parameters(std::size_t min_size) {
   MaxCliqueParameters parameters;
   parameters.min_size = min_size;
-  parameters.deadline = deadline;
+  parameters.deadline = std::chrono::seconds(1000);
+  parameters.max_work = kUnlimited;
+  parameters.max_tie_work = 4000000;
   return parameters;
 }
 
@@ -196,7 +199,7 @@ TEST(MaxClique, KnownSizesOfDenseGraphs) {
       }
     }
     const MaxCliqueResult result =
-        FindMaxClique(ConsistencyGraph::FromEdges(n, edges), Parameters(3, std::chrono::seconds(10)));
+        FindMaxClique(ConsistencyGraph::FromEdges(n, edges), Parameters(3));
     EXPECT_TRUE(result.proven_maximum);
     EXPECT_EQ(result.vertices.size(), size);
   }
@@ -211,7 +214,7 @@ TEST(MaxClique, HandlesNinetyPercentInliers) {
   Edges edges = RandomEdges(n, 0.3, random);
   Plant(members, edges);
   const ConsistencyGraph graph = ConsistencyGraph::FromEdges(n, edges);
-  const MaxCliqueResult result = FindMaxClique(graph, Parameters(6, std::chrono::seconds(5)));
+  const MaxCliqueResult result = FindMaxClique(graph, Parameters(6));
   EXPECT_TRUE(result.proven_maximum);
   EXPECT_EQ(result.vertices, members);
 }
@@ -221,7 +224,7 @@ TEST(MaxClique, SolvesDenseRandomGraphs) {
     SCOPED_TRACE("seed " + std::to_string(seed));
     std::mt19937 random(seed);
     const ConsistencyGraph graph = ConsistencyGraph::FromEdges(100, RandomEdges(100, 0.9, random));
-    const MaxCliqueResult result = FindMaxClique(graph, Parameters(6, std::chrono::seconds(5)));
+    const MaxCliqueResult result = FindMaxClique(graph, Parameters(6));
     EXPECT_TRUE(result.proven_maximum);
     EXPECT_TRUE(IsClique(graph, result.vertices));
     EXPECT_GE(result.vertices.size(), 28u);  // 29 to 36 in the literature's instances of this kind
@@ -232,13 +235,35 @@ TEST(MaxClique, SolvesDenseRandomGraphs) {
 TEST(MaxClique, ReturnsTheIncumbentAtTheDeadline) {
   std::mt19937 random(3);
   const ConsistencyGraph graph = ConsistencyGraph::FromEdges(500, RandomEdges(500, 0.9, random));
+  MaxCliqueParameters parameters = Parameters(6);
+  parameters.deadline = std::chrono::milliseconds(20);
   const auto start = std::chrono::steady_clock::now();
-  const MaxCliqueResult result = FindMaxClique(graph, Parameters(6, std::chrono::milliseconds(20)));
+  const MaxCliqueResult result = FindMaxClique(graph, parameters);
   EXPECT_LT(std::chrono::steady_clock::now() - start, std::chrono::seconds(1));
   EXPECT_FALSE(result.proven_maximum);
   EXPECT_GE(result.vertices.size(), 6u);
   EXPECT_TRUE(IsClique(graph, result.vertices));
   EXPECT_GT(result.upper_bound, result.vertices.size());
+}
+
+TEST(MaxClique, EndsAtItsEffortRepeatably) {
+  std::mt19937 random(4);
+  const ConsistencyGraph graph = ConsistencyGraph::FromEdges(400, RandomEdges(400, 0.9, random));
+  MaxCliqueParameters parameters = Parameters(6);
+  std::size_t size_before = 6;
+  for (const std::uint64_t work : {100000u, 1000000u, 3000000u}) {
+    parameters.max_work = work;
+    const MaxCliqueResult result = FindMaxClique(graph, parameters);
+    EXPECT_FALSE(result.proven_maximum);
+    EXPECT_FALSE(result.all_ties_compared);
+    EXPECT_TRUE(IsClique(graph, result.vertices));
+    EXPECT_GE(result.vertices.size(), size_before) << "more effort finds no less";
+    EXPECT_GT(result.upper_bound, result.vertices.size());
+    EXPECT_GT(result.work, work);
+    EXPECT_LT(result.work, work + work / 2) << "it ends soon after the limit";
+    EXPECT_EQ(FindMaxClique(graph, parameters).vertices, result.vertices);
+    size_before = result.vertices.size();
+  }
 }
 
 TEST(MaxClique, BoundsTheComparisonOfTiesRepeatably) {
@@ -277,9 +302,14 @@ TEST(MaxClique, HandlesGraphsWithoutEdges) {
 
 TEST(MaxClique, RefusesBadParameters) {
   EXPECT_THROW(FindMaxClique(ConsistencyGraph(), Parameters(2)), std::invalid_argument);
-  EXPECT_THROW(FindMaxClique(ConsistencyGraph(), Parameters(3, std::chrono::microseconds(0))), std::invalid_argument);
   MaxCliqueParameters parameters;
   parameters.max_ties = 0;
+  EXPECT_THROW(FindMaxClique(ConsistencyGraph(), parameters), std::invalid_argument);
+  parameters = Parameters(3);
+  parameters.max_work = 0;
+  EXPECT_THROW(FindMaxClique(ConsistencyGraph(), parameters), std::invalid_argument);
+  parameters = Parameters(3);
+  parameters.deadline = std::chrono::microseconds(0);
   EXPECT_THROW(FindMaxClique(ConsistencyGraph(), parameters), std::invalid_argument);
 }
 

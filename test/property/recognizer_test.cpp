@@ -397,7 +397,8 @@ TEST(Recognizer, RefusesBadParameters) {
   refused([](RecognizerParameters& p) { p.max_rms_m = 0.0; });
   refused([](RecognizerParameters& p) { p.min_spread_m = 0.0; });
   refused([](RecognizerParameters& p) { p.min_sigma_m = 0.0; });
-  refused([](RecognizerParameters& p) { p.runner_up_deadline = std::chrono::microseconds(0); });
+  refused([](RecognizerParameters& p) { p.clique.max_work = 0; });
+  refused([](RecognizerParameters& p) { p.clique.deadline = std::chrono::microseconds(0); });
 }
 
 }  // namespace
