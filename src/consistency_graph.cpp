@@ -160,35 +160,77 @@ std::size_t ScreenPortable(const ScreenArrays& arrays, std::uint32_t i, const st
 }
 
 #ifdef SEGMATCH_HAS_AVX2_KERNEL
-/// The same as ScreenPortable, eight at a time.
-__attribute__((target("avx2,fma"))) std::size_t ScreenAvx2(const ScreenArrays& arrays, std::uint32_t i,
-                                                       const std::vector<Range>& ranges, std::uint32_t* hits) {
-  const float* const lx = arrays.coordinates[0].data();
-  const float* const ly = arrays.coordinates[1].data();
-  const float* const lz = arrays.coordinates[2].data();
-  const float* const tx = arrays.coordinates[3].data();
-  const float* const ty = arrays.coordinates[4].data();
-  const float* const tz = arrays.coordinates[5].data();
-  const __m256 lx_i = _mm256_set1_ps(lx[i]), ly_i = _mm256_set1_ps(ly[i]), lz_i = _mm256_set1_ps(lz[i]);
-  const __m256 tx_i = _mm256_set1_ps(tx[i]), ty_i = _mm256_set1_ps(ty[i]), tz_i = _mm256_set1_ps(tz[i]);
-  const __m256 factor = _mm256_set1_ps(arrays.factor);
+#define SEGMATCH_AVX2 __attribute__((target("avx2,fma,bmi,popcnt")))
+
+/// What ScreenPortable reads of the matches, from the first on, and of the one that they are compared with.
+struct ScreenOperands {
+  SEGMATCH_AVX2 ScreenOperands(const ScreenArrays& arrays, std::uint32_t i)
+      : lx(arrays.coordinates[0].data()),
+        ly(arrays.coordinates[1].data()),
+        lz(arrays.coordinates[2].data()),
+        tx(arrays.coordinates[3].data()),
+        ty(arrays.coordinates[4].data()),
+        tz(arrays.coordinates[5].data()),
+        lx_i(_mm256_set1_ps(lx[i])),
+        ly_i(_mm256_set1_ps(ly[i])),
+        lz_i(_mm256_set1_ps(lz[i])),
+        tx_i(_mm256_set1_ps(tx[i])),
+        ty_i(_mm256_set1_ps(ty[i])),
+        tz_i(_mm256_set1_ps(tz[i])),
+        factor(_mm256_set1_ps(arrays.factor)) {}
+
+  const float *lx, *ly, *lz, *tx, *ty, *tz;
+  __m256 lx_i, ly_i, lz_i, tx_i, ty_i, tz_i, factor;
+};
+
+/// One bit for each of eight matches from j on.
+SEGMATCH_AVX2 inline std::uint32_t ScreenEight(const ScreenOperands& of, std::uint32_t j) {
+  const __m256 a = _mm256_sub_ps(of.lx_i, _mm256_loadu_ps(of.lx + j));
+  const __m256 b = _mm256_sub_ps(of.ly_i, _mm256_loadu_ps(of.ly + j));
+  const __m256 c = _mm256_sub_ps(of.lz_i, _mm256_loadu_ps(of.lz + j));
+  const __m256 d = _mm256_sub_ps(of.tx_i, _mm256_loadu_ps(of.tx + j));
+  const __m256 e = _mm256_sub_ps(of.ty_i, _mm256_loadu_ps(of.ty + j));
+  const __m256 f = _mm256_sub_ps(of.tz_i, _mm256_loadu_ps(of.tz + j));
+  const __m256 local = _mm256_fmadd_ps(a, a, _mm256_fmadd_ps(b, b, _mm256_mul_ps(c, c)));
+  const __m256 target = _mm256_fmadd_ps(d, d, _mm256_fmadd_ps(e, e, _mm256_mul_ps(f, f)));
+  const __m256 difference = _mm256_sub_ps(local, target);
+  const __m256 near = _mm256_cmp_ps(_mm256_mul_ps(difference, difference),
+                                    _mm256_mul_ps(of.factor, _mm256_add_ps(local, target)), _CMP_LE_OQ);
+  return static_cast<std::uint32_t>(_mm256_movemask_ps(near));
+}
+
+/// Appends j + k for each bit k of the mask and returns the new count. Most masks have at most two bits, but which ones
+/// have any is anybody's guess: without a branch for that, nothing is guessed wrongly.
+SEGMATCH_AVX2 inline std::size_t AppendBits(std::uint32_t mask, std::uint32_t j, std::uint32_t* hits,
+                                            std::size_t count) {
+  const auto bits = static_cast<std::size_t>(_mm_popcnt_u32(mask));
+  hits[count] = j + _tzcnt_u32(mask);
+  mask = _blsr_u32(mask);
+  hits[count + 1] = j + _tzcnt_u32(mask);
+  for (std::size_t k = 2; k < bits; ++k) {
+    mask = _blsr_u32(mask);
+    hits[count + k] = j + _tzcnt_u32(mask);
+  }
+  return count + bits;
+}
+
+/// The same as ScreenPortable, thirty-two at a time, and the rest of a range eight at a time.
+SEGMATCH_AVX2 std::size_t ScreenAvx2(const ScreenArrays& arrays, std::uint32_t i, const std::vector<Range>& ranges,
+                                     std::uint32_t* hits) {
+  const ScreenOperands of(arrays, i);
   std::size_t count = 0;
   for (const Range range : ranges) {
-    for (std::uint32_t j = range.begin; j < range.end; j += kLanes) {
-      const __m256 a = _mm256_sub_ps(_mm256_loadu_ps(lx + j), lx_i);
-      const __m256 b = _mm256_sub_ps(_mm256_loadu_ps(ly + j), ly_i);
-      const __m256 c = _mm256_sub_ps(_mm256_loadu_ps(lz + j), lz_i);
-      const __m256 d = _mm256_sub_ps(_mm256_loadu_ps(tx + j), tx_i);
-      const __m256 e = _mm256_sub_ps(_mm256_loadu_ps(ty + j), ty_i);
-      const __m256 f = _mm256_sub_ps(_mm256_loadu_ps(tz + j), tz_i);
-      const __m256 local = _mm256_fmadd_ps(a, a, _mm256_fmadd_ps(b, b, _mm256_mul_ps(c, c)));
-      const __m256 target = _mm256_fmadd_ps(d, d, _mm256_fmadd_ps(e, e, _mm256_mul_ps(f, f)));
-      const __m256 difference = _mm256_sub_ps(local, target);
-      const __m256 near = _mm256_cmp_ps(_mm256_mul_ps(difference, difference),
-                                        _mm256_mul_ps(factor, _mm256_add_ps(local, target)), _CMP_LE_OQ);
-      unsigned mask = static_cast<unsigned>(_mm256_movemask_ps(near));
+    std::uint32_t j = range.begin;
+    for (; j + 4 * kLanes <= range.end; j += 4 * kLanes) {
+      const std::uint32_t mask = ScreenEight(of, j) | ScreenEight(of, j + kLanes) << kLanes |
+                                 ScreenEight(of, j + 2 * kLanes) << 2 * kLanes |
+                                 ScreenEight(of, j + 3 * kLanes) << 3 * kLanes;
+      count = AppendBits(mask, j, hits, count);
+    }
+    for (; j < range.end; j += kLanes) {
+      std::uint32_t mask = ScreenEight(of, j);
       if (range.end - j < kLanes) mask &= (1u << (range.end - j)) - 1u;
-      for (; mask != 0; mask &= mask - 1) hits[count++] = j + static_cast<std::uint32_t>(__builtin_ctz(mask));
+      count = AppendBits(mask, j, hits, count);
     }
   }
   return count;
@@ -199,7 +241,10 @@ using ScreenFunction = std::size_t (*)(const ScreenArrays&, std::uint32_t, const
 
 ScreenFunction ChooseScreen(bool use_avx2) {
 #ifdef SEGMATCH_HAS_AVX2_KERNEL
-  if (use_avx2 && __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) return ScreenAvx2;
+  if (use_avx2 && __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi") &&
+      __builtin_cpu_supports("popcnt")) {
+    return ScreenAvx2;
+  }
 #endif
   (void)use_avx2;
   return ScreenPortable;
