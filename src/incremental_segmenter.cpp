@@ -34,24 +34,23 @@ SegmentUpdate IncrementalSegmenter<Policy>::Remove(const std::vector<RemovedVoxe
       SetState(&cluster, State::kCut);
       MarkDirty(&cluster);
     }
-    BlockNode& block = BlockOf(gone.voxel);
-    block.clustered &= ~CellBit(gone.voxel);
-    if (block.label == kMixed) Release(labels_[gone.voxel]);
-    if (block.clustered == 0) SetLabel(&block.label, kNoLabel);
+    RemoveCell(&BlockOf(gone.voxel), CellBit(gone.voxel));
   }
   return Settle();
 }
 
 template <class Policy>
 SegmentUpdate IncrementalSegmenter<Policy>::Insert(const VoxelUpdate& update) {
-  labels_.Grow(grid_->handle_capacity());
-  blocks_.Grow(labels_.size() / DynamicVoxelGrid::kCellsPerBlock);
+  blocks_.Grow(grid_->handle_capacity() / DynamicVoxelGrid::kCellsPerBlock);
   FollowCentroids(update.moved);
   for (const VoxelHandle voxel : update.activated) BlockOf(voxel).pending |= CellBit(voxel);
   seeds_ = update.activated;
   policy_.PrepareSeeds(&seeds_);
-  for (const VoxelHandle seed : seeds_)
-    if (!IsClustered(seed)) GrowFromSeed(seed);
+  constexpr std::size_t kAhead = 8;
+  for (std::size_t i = 0; i < seeds_.size(); ++i) {
+    if (i + kAhead < seeds_.size()) PrefetchAround(seeds_[i + kAhead]);
+    if (!IsClustered(seeds_[i])) GrowFromSeed(seeds_[i]);
+  }
   if constexpr (!Policy::kAcceptsAll) {
     rough_.insert(rough_.end(), update.activated.begin(), update.activated.end());
     for (const VoxelHandle voxel : rough_)
@@ -78,24 +77,38 @@ SegmentUpdate IncrementalSegmenter<Policy>::DismissTrails(const std::vector<Segm
 template <class Policy>
 void IncrementalSegmenter<Policy>::FollowCentroids(const std::vector<MovedVoxel>& moved_voxels) {
   const BlockNode* block = nullptr;
+  const Part* part = nullptr;
+  Cluster* cluster = nullptr;
   Eigen::Vector3d corner = Eigen::Vector3d::Zero();
-  Label root = kNoLabel;
   constexpr std::size_t kAhead = 16;
   for (std::size_t i = 0; i < moved_voxels.size(); ++i) {
     const MovedVoxel& moved = moved_voxels[i];
+    const std::uint64_t bit = CellBit(moved.voxel);
     if (i + kAhead < moved_voxels.size()) __builtin_prefetch(&BlockOf(moved_voxels[i + kAhead].voxel));
     if (block != &BlockOf(moved.voxel)) {
       block = &BlockOf(moved.voxel);
       corner = grid_->BlockCorner(moved.voxel);
-      root = block->label < kMixed ? FindRoot(block->label) : kNoLabel;
+      part = nullptr;
     }
-    if ((block->clustered & CellBit(moved.voxel)) == 0) continue;
-    Cluster& cluster = ClusterAt(root != kNoLabel ? root : FindRoot(labels_[moved.voxel]));
-    if (cluster.state == State::kTooLarge) continue;
-    cluster.moments.Move(corner + moved.before_block.cast<double>(), corner + moved.after_block.cast<double>());
-    cluster.grew = true;
-    MarkDirty(&cluster);
+    if ((block->clustered & bit) == 0) continue;
+    if (part == nullptr || (part->cells & bit) == 0) {
+      part = &PartOf(*block, bit);
+      cluster = &ClusterAt(FindRoot(part->label));
+    }
+    if (cluster->state == State::kTooLarge) continue;
+    cluster->moments.Move(corner + moved.before_block.cast<double>(), corner + moved.after_block.cast<double>());
+    cluster->grew = true;
+    MarkDirty(cluster);
   }
+}
+
+/// Starts to fetch what growing from there will read.
+template <class Policy>
+void IncrementalSegmenter<Policy>::PrefetchAround(VoxelHandle voxel) const {
+  grid_->ForEachStencilBlock(stencil_, voxel, [this](std::uint32_t slot, const NeighbourStencil::BlockVisit&) {
+    __builtin_prefetch(&blocks_[slot], 1);
+    return true;
+  });
 }
 
 /// Algorithm 1: the region of new voxels that is reached from the seed joins, and links, the clusters that it meets.
@@ -168,8 +181,8 @@ void IncrementalSegmenter<Policy>::JoinFlattestCluster(VoxelHandle voxel) {
   AddVoxel(FindRoot(LabelOf(flattest.second)), voxel);
 }
 
-/// The same where every neighbour counts: of a block whose voxels are all of one cluster, one within the radius decides, and
-/// none need be looked at if the region met that cluster before.
+/// The same where every neighbour counts: of the voxels of a part, one within the radius decides, and none need be looked
+/// at if the region met their cluster before.
 template <class Policy>
 typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::VisitNeighbourBlocks(VoxelHandle from, Label root) {
   const float radius2 = static_cast<float>(stencil_.radius_m() * stencil_.radius_m());
@@ -177,28 +190,23 @@ typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::Visit
   const Eigen::Vector3f center = grid_->CentroidInBlock(from);
   grid_->ForEachStencilBlock(stencil_, from, [&](std::uint32_t slot, const NeighbourStencil::BlockVisit& at) {
     BlockNode& block = blocks_[slot];
-    std::uint64_t pending = block.pending & at.cells;
-    std::uint64_t clustered = block.clustered & at.cells;
-    if (clustered != 0 && block.label != kMixed) {
-      SetLabel(&block.label, FindRoot(block.label));
-      if (block.label == root) clustered = 0;
-    }
-    if ((pending | clustered) == 0) return true;
-
+    if (((block.pending | block.clustered) & at.cells) == 0) return true;
     const Eigen::Vector3f shift(at.offset[0] * block_size_m - center.x(), at.offset[1] * block_size_m - center.y(),
                                 at.offset[2] * block_size_m - center.z());
-    const auto is_near = [&](VoxelHandle to) { return (grid_->CentroidInBlock(to) + shift).squaredNorm() <= radius2; };
     const auto first_of = [&](std::uint64_t cells) {
       return slot * DynamicVoxelGrid::kCellsPerBlock + static_cast<VoxelHandle>(__builtin_ctzll(cells));
     };
-    for (; pending != 0; pending &= pending - 1)
-      if (is_near(first_of(pending))) Queue(first_of(pending));
-    for (; clustered != 0; clustered &= clustered - 1) {
-      const VoxelHandle to = first_of(clustered);
-      const Label label = LabelOf(to);
-      if (label == root || !is_near(to)) continue;
-      root = Meet(root, label);
-      if (block.label != kMixed) break;
+    const auto is_near = [&](VoxelHandle to) { return (grid_->CentroidInBlock(to) + shift).squaredNorm() <= radius2; };
+    for (std::uint64_t cells = block.pending & at.cells; cells != 0; cells &= cells - 1)
+      if (is_near(first_of(cells))) Queue(first_of(cells));
+    if ((block.clustered & at.cells) == 0) return true;
+    for (Part* part = &block.parts.front(); part != nullptr; part = Next(part)) {
+      std::uint64_t cells = part->cells & at.cells;
+      if (cells == 0) continue;
+      SetLabel(part, FindRoot(part->label));
+      if (part->label == root) continue;
+      while (cells != 0 && !is_near(first_of(cells))) cells &= cells - 1;
+      if (cells != 0) root = Meet(root, part->label);
     }
     return true;
   });
@@ -227,26 +235,63 @@ void IncrementalSegmenter<Policy>::Release(Label label) const {
   }
 }
 
-/// Replaces a reference to a label, kNoLabel and kMixed being none.
 template <class Policy>
-void IncrementalSegmenter<Policy>::SetLabel(Label* at, Label label) {
-  const Label old = *at;
+void IncrementalSegmenter<Policy>::SetLabel(Part* part, Label label) {
+  const Label old = part->label;
   if (old == label) return;
-  if (label < kMixed) ++nodes_[label].references;
-  *at = label;
-  if (old < kMixed) Release(old);
+  if (label != kNoLabel) ++nodes_[label].references;
+  part->label = label;
+  if (old != kNoLabel) Release(old);
 }
 
-/// From now on each clustered voxel of this one's block has a label of its own.
+/// The part of a block for voxels of this cluster: parts that have become one cluster become one part.
 template <class Policy>
-void IncrementalSegmenter<Policy>::MixLabels(VoxelHandle voxel) {
-  BlockNode& block = BlockOf(voxel);
-  const VoxelHandle first = voxel - voxel % DynamicVoxelGrid::kCellsPerBlock;
-  for (std::uint64_t cells = block.clustered; cells != 0; cells &= cells - 1) {
-    labels_[first + static_cast<VoxelHandle>(__builtin_ctzll(cells))] = block.label;
-    ++nodes_[block.label].references;
+typename IncrementalSegmenter<Policy>::Part& IncrementalSegmenter<Policy>::PartFor(BlockNode* block, Label root) {
+  Part* own = nullptr;
+  Part* free = nullptr;
+  Part* last = nullptr;
+  for (Part* part = &block->parts.front(); part != nullptr; part = Next(part)) {
+    last = part;
+    if (part->cells == 0) {
+      if (free == nullptr) free = part;
+    } else if (FindRoot(part->label) == root) {
+      if (own == nullptr) {
+        own = part;
+      } else {
+        own->cells |= part->cells;
+        *part = {0, part->label, part->next};
+        SetLabel(part, kNoLabel);
+      }
+    }
   }
-  SetLabel(&block.label, kMixed);
+  if (own != nullptr) return *own;
+  if (free == nullptr) {
+    std::uint32_t index = part_slots_;
+    if (free_parts_.empty()) {
+      more_parts_.Grow(++part_slots_);
+    } else {
+      index = free_parts_.back();
+      free_parts_.pop_back();
+    }
+    last->next = index;
+    free = &more_parts_[index];
+  }
+  SetLabel(free, root);
+  return *free;
+}
+
+template <class Policy>
+void IncrementalSegmenter<Policy>::RemoveCell(BlockNode* block, std::uint64_t bit) {
+  Part* part = &block->parts.front();
+  while ((part->cells & bit) == 0) part = Next(part);
+  block->clustered &= ~bit;
+  part->cells &= ~bit;
+  if (part->cells == 0) SetLabel(part, kNoLabel);
+  if (block->clustered != 0) return;
+  for (std::uint32_t more = std::exchange(block->parts.back().next, kNoPart); more != kNoPart;) {
+    free_parts_.push_back(more);
+    more = std::exchange(more_parts_[more].next, kNoPart);
+  }
 }
 
 template <class Policy>
@@ -277,15 +322,7 @@ typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::NewCl
 template <class Policy>
 void IncrementalSegmenter<Policy>::AddVoxel(Label root, VoxelHandle voxel) {
   BlockNode& block = BlockOf(voxel);
-  if (block.clustered == 0) {
-    SetLabel(&block.label, root);
-  } else if (block.label != kMixed && FindRoot(block.label) != root) {
-    MixLabels(voxel);
-  }
-  if (block.label == kMixed) {
-    labels_[voxel] = root;
-    ++nodes_[root].references;
-  }
+  PartFor(&block, root).cells |= CellBit(voxel);
   block.clustered |= CellBit(voxel);
   Cluster& cluster = ClusterAt(root);
   ++cluster.live_voxels;
@@ -461,7 +498,8 @@ std::vector<SegmentId> IncrementalSegmenter<Policy>::Segments() const {
 template <class Policy>
 std::size_t IncrementalSegmenter<Policy>::memory_bytes() const {
   return nodes_.capacity() * sizeof(Node) + free_nodes_.capacity() * sizeof(Label) + clusters_.capacity() * sizeof(Cluster) +
-         free_clusters_.capacity() * sizeof(ClusterIndex) + labels_.memory_bytes() + blocks_.memory_bytes() +
+         free_clusters_.capacity() * sizeof(ClusterIndex) + blocks_.memory_bytes() + more_parts_.memory_bytes() +
+         free_parts_.capacity() * sizeof(std::uint32_t) +
          (seeds_.capacity() + queue_.capacity() + region_.capacity() + rough_.capacity()) * sizeof(VoxelHandle);
 }
 

@@ -2,6 +2,7 @@
 /// Incremental region growing with segment tracking (METHOD 3; thesis 3.3).
 #pragma once
 
+#include <array>
 #include <cstddef>
 #include <cstdint>
 #include <utility>
@@ -104,7 +105,7 @@ class Segmenter {
 /// and accepted by the policy, when the later of the two was clustered"; a cluster never splits. Where the policy lets
 /// not every point seed, only points that may seed link; one that may not joins the flattest of the points around it
 /// that accept it, alone. Union-find over labels persists between calls; labels and clusters are reference-counted and
-/// reclaimed. Remove is O(removed), Insert O(activated * neighbours + moved), both nearly. Not thread-safe. The grid
+/// reclaimed. Labels are carried by parts of the grid's blocks, so that many voxels can be settled at once. Remove is O(removed), Insert O(activated * neighbours + moved), both nearly. Not thread-safe. The grid
 /// must outlive the segmenter.
 template <class Policy>
 class IncrementalSegmenter final : public Segmenter {
@@ -127,15 +128,16 @@ class IncrementalSegmenter final : public Segmenter {
  private:
   using Label = std::uint32_t;
   using ClusterIndex = std::uint32_t;
-  static constexpr Label kNoLabel = 0xffffffffu;  // of a block without clustered voxels
-  static constexpr Label kMixed = 0xfffffffeu;    // of a block with voxels of several labels
+  static constexpr Label kNoLabel = 0xffffffffu;
+  static constexpr std::uint32_t kNoPart = 0xffffffffu;
+  static constexpr std::uint32_t kBeside = 0xfffffffeu;  // the next one in memory
 
   enum class State : std::uint8_t { kFree, kSmall, kSegment, kTrail, kCut, kTooLarge };  // of two that link, the later
 
   // A label: node of the union-find forest.
   struct Node {
     Label parent = kNoLabel;       // itself at roots
-    std::uint32_t references = 0;  // blocks, and voxels of mixed blocks, that carry it, and nodes that point to it
+    std::uint32_t references = 0;  // parts that carry it, and nodes that point to it
     ClusterIndex cluster = 0;      // at roots
   };
   struct Cluster {
@@ -148,22 +150,38 @@ class IncrementalSegmenter final : public Segmenter {
     SegmentMoments moments;         // kTooLarge: of the voxels until then, nobody will read them again
     std::vector<SegmentId> absorbed;  // IDs of segments that merged into it in this call
   };
+  // Clustered voxels of a block that carry one label.
+  struct Part {
+    std::uint64_t cells = 0;       // none: the part is free
+    Label label = kNoLabel;        // of a free part: none
+    std::uint32_t next = kNoPart;  // of more_parts_, or kBeside
+  };
   // What is known of a block of the grid, so that its voxels need not be looked at one by one. Active cells that are
-  // neither pending nor clustered are of the region that grows now.
-  struct alignas(32) BlockNode {
+  // neither pending nor clustered are of the region that grows now. Few blocks hold more than three clusters: further
+  // parts hang on the last of these.
+  struct alignas(64) BlockNode {
     std::uint64_t pending = 0;    // cells that are active and neither clustered nor queued yet
-    std::uint64_t clustered = 0;  // cells that are clustered
-    Label label = kNoLabel;       // of all its clustered voxels; or kMixed: each has its own
+    std::uint64_t clustered = 0;  // cells that are clustered: those of all parts
+    std::array<Part, 3> parts{{{0, kNoLabel, kBeside}, {0, kNoLabel, kBeside}, {0, kNoLabel, kNoPart}}};
   };
 
   bool IsClustered(VoxelHandle voxel) const {
-    return voxel < labels_.size() && (BlockOf(voxel).clustered & CellBit(voxel)) != 0;
+    return voxel / DynamicVoxelGrid::kCellsPerBlock < blocks_.size() && (BlockOf(voxel).clustered & CellBit(voxel)) != 0;
+  }
+  // The block's part after this one; null after the last.
+  const Part* Next(const Part* part) const {
+    if (part->next == kBeside) return part + 1;
+    return part->next != kNoPart ? &more_parts_[part->next] : nullptr;
+  }
+  Part* Next(Part* part) { return const_cast<Part*>(Next(static_cast<const Part*>(part))); }
+  // The part of a clustered cell.
+  const Part& PartOf(const BlockNode& block, std::uint64_t bit) const {
+    const Part* part = &block.parts.front();
+    while ((part->cells & bit) == 0) part = Next(part);
+    return *part;
   }
   // Of a clustered voxel.
-  Label LabelOf(VoxelHandle voxel) const {
-    const Label label = BlockOf(voxel).label;
-    return label != kMixed ? label : labels_[voxel];
-  }
+  Label LabelOf(VoxelHandle voxel) const { return PartOf(BlockOf(voxel), CellBit(voxel)).label; }
   Eigen::Vector3d PointOf(VoxelHandle voxel, const Eigen::Vector3f& in_block) const {
     return grid_->BlockCorner(voxel) + in_block.cast<double>();
   }
@@ -176,12 +194,14 @@ class IncrementalSegmenter final : public Segmenter {
   void Release(Label label) const;
   Cluster& ClusterAt(Label root) { return clusters_[nodes_[root].cluster]; }
   Label NewCluster();
+  void PrefetchAround(VoxelHandle voxel) const;
   void GrowFromSeed(VoxelHandle seed);
   void FollowCentroids(const std::vector<MovedVoxel>& moved);
   void Queue(VoxelHandle voxel);
   Label Meet(Label root, Label other);
-  void SetLabel(Label* at, Label label);
-  void MixLabels(VoxelHandle voxel);
+  void SetLabel(Part* part, Label label);
+  Part& PartFor(BlockNode* block, Label root);
+  void RemoveCell(BlockNode* block, std::uint64_t bit);
   Label VisitNeighbours(VoxelHandle from, Label root);
   void JoinFlattestCluster(VoxelHandle voxel);
   Label VisitNeighbourBlocks(VoxelHandle from, Label root);
@@ -205,7 +225,9 @@ class IncrementalSegmenter final : public Segmenter {
   std::vector<Cluster> clusters_;
   std::vector<ClusterIndex> free_clusters_;
   PagedArray<BlockNode> blocks_;  // by handle / DynamicVoxelGrid::kCellsPerBlock
-  PagedArray<Label> labels_;      // by handle, of clustered voxels of mixed blocks
+  PagedArray<Part> more_parts_;   // of blocks that have more than they hold
+  std::uint32_t part_slots_ = 0;  // of them, ever used
+  std::vector<std::uint32_t> free_parts_;
   std::vector<ClusterIndex> dirty_;
   std::vector<std::pair<SegmentId, ClusterIndex>> tracked_;  // ascending IDs
   std::vector<VoxelHandle> seeds_, queue_, region_, rough_;  // work space
