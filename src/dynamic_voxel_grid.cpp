@@ -1,10 +1,15 @@
 #include "incremental_segmatch/dynamic_voxel_grid.hpp"
 
 #include <algorithm>
+#include <functional>
 #include <limits>
+#include <numeric>
+#include <optional>
+#include <queue>
 #include <stdexcept>
 #include <string>
 #include <unordered_map>
+#include <utility>
 
 // Compiled for processors with AVX2 as well, and chosen at run time; the results are the same.
 #if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__gnu_linux__)
@@ -33,6 +38,16 @@ std::uint64_t PackBlock(const std::array<std::int32_t, 3>& c) {
   constexpr std::uint64_t kMask = (1u << 21) - 1;
   return ((static_cast<std::uint64_t>(c[2]) & kMask) << 42) | ((static_cast<std::uint64_t>(c[1]) & kMask) << 21) |
          (static_cast<std::uint64_t>(c[0]) & kMask);
+}
+
+struct SquareDistances {
+  double nearest_m, farthest_m;
+};
+
+/// Of the nearest and the farthest point of a square with this lower corner.
+SquareDistances DistancesToSquare(const Eigen::Vector2d& from, const Eigen::Vector2d& corner, double side_m) {
+  const Eigen::Array2d to_lower = (from - corner).array(), to_upper = to_lower - side_m;
+  return {(-to_lower).max(to_upper).max(0.0).matrix().norm(), to_lower.abs().max(to_upper.abs()).matrix().norm()};
 }
 
 }  // namespace
@@ -128,7 +143,8 @@ class DynamicVoxelGrid::BlockMap {
   std::size_t size_ = 0;
 };
 
-/// Blocks by columns of 8 x 8 blocks: removal looks at whole columns first.
+/// Blocks by columns of 8 x 8 blocks: removal looks at whole columns first, and only when the boundary may have come to
+/// them.
 class DynamicVoxelGrid::TileMap {
  public:
   struct Tile {
@@ -136,6 +152,7 @@ class DynamicVoxelGrid::TileMap {
     std::vector<std::uint32_t> blocks;
   };
 
+  /// A new tile is due at once.
   std::uint32_t FindOrAdd(int x, int y) {
     const auto [it, added] = index_.try_emplace(PackTile(x, y), static_cast<std::uint32_t>(tiles_.size()));
     if (added) {
@@ -147,18 +164,30 @@ class DynamicVoxelGrid::TileMap {
       }
       tiles_[it->second].x = x;
       tiles_[it->second].y = y;
+      PutOff(it->second, -std::numeric_limits<double>::infinity());
     }
     return it->second;
   }
   Tile& tile(std::uint32_t index) { return tiles_[index]; }
-  void Free(std::uint32_t index) {
-    index_.erase(PackTile(tiles_[index].x, tiles_[index].y));
-    tiles_[index].blocks = {};
-    free_.push_back(index);
-  }
   const std::vector<Tile>& tiles() const { return tiles_; }
+
+  /// The tile is not looked at before the boundary has advanced to there.
+  void PutOff(std::uint32_t index, double due_m) { waiting_.emplace(due_m, index); }
+  /// The next tile that is due and has blocks; none if nothing is. Whoever takes it puts it off again.
+  std::optional<std::uint32_t> TakeDue(double advance_m) {
+    while (!waiting_.empty() && waiting_.top().first <= advance_m) {
+      const std::uint32_t index = waiting_.top().second;
+      waiting_.pop();
+      if (!tiles_[index].blocks.empty()) return index;
+      index_.erase(PackTile(tiles_[index].x, tiles_[index].y));
+      tiles_[index].blocks = {};
+      free_.push_back(index);
+    }
+    return std::nullopt;
+  }
+
   std::size_t memory_bytes() const {
-    std::size_t bytes = tiles_.size() * (sizeof(Tile) + 32);
+    std::size_t bytes = tiles_.size() * (sizeof(Tile) + 32) + waiting_.size() * sizeof(std::pair<double, std::uint32_t>);
     for (const Tile& tile : tiles_) bytes += tile.blocks.capacity() * sizeof(std::uint32_t);
     return bytes;
   }
@@ -167,6 +196,8 @@ class DynamicVoxelGrid::TileMap {
   std::unordered_map<std::uint64_t, std::uint32_t> index_;
   std::vector<Tile> tiles_;
   std::vector<std::uint32_t> free_;
+  std::priority_queue<std::pair<double, std::uint32_t>, std::vector<std::pair<double, std::uint32_t>>, std::greater<>>
+      waiting_;  // every tile that is not free, by when it is due
 };
 
 DynamicVoxelGrid::DynamicVoxelGrid(const DynamicVoxelGridParameters& parameters)
@@ -228,7 +259,7 @@ VoxelUpdate DynamicVoxelGrid::Insert(const Points& points_sensor, const Pose& T_
     const std::size_t count = FindVoxels(chunk, runs.data(), &update);
     for (std::size_t i = 0; i < count; ++i) AddRun(runs[i], &update);
   }
-  SettleTouched(&update);
+  ActivateTouched(&update);
   last_moved_ = update.moved.size();
   return update;
 }
@@ -307,16 +338,20 @@ std::size_t DynamicVoxelGrid::FindVoxels(const Chunk& chunk, Run* runs, VoxelUpd
   return static_cast<std::size_t>(run + 1 - runs);
 }
 
-/// While a voxel is touched its centroid is the sum of its points.
+/// (3.4).
 void DynamicVoxelGrid::AddRun(const Run& run, VoxelUpdate* update) {
   Block& home = blocks_[run.slot];
   Voxel& voxel = voxels_[run.slot][run.cell];
   const std::uint64_t bit = std::uint64_t{1} << run.cell;
-  const VoxelHandle handle = run.slot * kCellsPerBlock + run.cell;
+  if (home.last_insertion != insertions_) {
+    home.last_insertion = insertions_;
+    home.touched = 0;
+  }
   if (!(home.touched & bit)) {
     home.touched |= bit;
+    const VoxelHandle handle = run.slot * kCellsPerBlock + run.cell;
     if (home.active & bit) {
-      update->moved.push_back({handle, voxel.centroid_block, Eigen::Vector3f::Zero()});
+      update->moved.push_back({handle, voxel.centroid_block});
     } else {
       touched_inactive_.push_back(handle);
       if (!(home.occupied & bit)) {
@@ -325,40 +360,19 @@ void DynamicVoxelGrid::AddRun(const Run& run, VoxelUpdate* update) {
         ++occupied_voxels_;
       }
     }
-    voxel.centroid_block *= static_cast<float>(voxel.count);
   }
-  voxel.centroid_block += run.sum_block;
+  const float n = static_cast<float>(voxel.count);
   voxel.count += run.count;
+  voxel.centroid_block = (n * voxel.centroid_block + run.sum_block) * (1.f / static_cast<float>(voxel.count));
 }
 
-/// (3.4): sums become centroids. Reports what became of the voxels that got points.
-void DynamicVoxelGrid::SettleTouched(VoxelUpdate* update) {
-  constexpr std::size_t kAhead = 16;
-  const auto prefetch = [this](VoxelHandle voxel) {
-    __builtin_prefetch(&blocks_[voxel / kCellsPerBlock], 1);
-    __builtin_prefetch(&VoxelAt(voxel), 1);
-  };
-  const auto settle = [this](VoxelHandle handle) -> const Voxel& {
-    Block& home = blocks_[handle / kCellsPerBlock];
-    Voxel& voxel = VoxelAt(handle);
-    home.touched &= ~(std::uint64_t{1} << (handle % kCellsPerBlock));
-    home.last_insertion = insertions_;
-    voxel.centroid_block *= 1.f / static_cast<float>(voxel.count);
-    return voxel;
-  };
-  std::vector<MovedVoxel>& moved = update->moved;
-  for (std::size_t i = 0; i < moved.size(); ++i) {
-    if (i + kAhead < moved.size()) prefetch(moved[i + kAhead].voxel);
-    moved[i].after_block = settle(moved[i].voxel).centroid_block;
-  }
+void DynamicVoxelGrid::ActivateTouched(VoxelUpdate* update) {
   const std::uint32_t min_points = static_cast<std::uint32_t>(parameters_.min_points_per_voxel);
   update->activated.reserve(touched_inactive_.size());
-  for (std::size_t i = 0; i < touched_inactive_.size(); ++i) {
-    const VoxelHandle handle = touched_inactive_[i];
-    if (i + kAhead < touched_inactive_.size()) prefetch(touched_inactive_[i + kAhead]);
-    if (settle(handle).count < min_points) continue;
-    blocks_[handle / kCellsPerBlock].active |= std::uint64_t{1} << (handle % kCellsPerBlock);
-    update->activated.push_back(handle);
+  for (const VoxelHandle voxel : touched_inactive_) {
+    if (VoxelAt(voxel).count < min_points) continue;
+    blocks_[voxel / kCellsPerBlock].active |= std::uint64_t{1} << (voxel % kCellsPerBlock);
+    update->activated.push_back(voxel);
   }
   active_voxels_ += update->activated.size();
 }
@@ -366,43 +380,55 @@ void DynamicVoxelGrid::SettleTouched(VoxelUpdate* update) {
 VoxelUpdate DynamicVoxelGrid::RemoveOutside(const Eigen::Vector3d& center_odom, double radius_m,
                                             std::uint32_t oldest_insertion) {
   VoxelUpdate update;
-  const Eigen::Vector3d center = T_odom_grid_.inverse() * center_odom;
+  const Eigen::Vector2d center = (T_odom_grid_.inverse() * center_odom).head<2>();
   const double radius2 = radius_m * radius_m;
   const double block_m = kBlockSide * parameters_.resolution_m;
-  // Squared distances in x-y of the nearest and the farthest point of a square with this lower corner.
-  const auto distances2 = [&](double corner_x, double corner_y, double side) {
-    const double dx = center.x() - corner_x, dy = center.y() - corner_y;
-    const double near_x = dx < 0 ? -dx : std::max(0.0, dx - side), near_y = dy < 0 ? -dy : std::max(0.0, dy - side);
-    const double far_x = std::max(std::abs(dx), std::abs(dx - side)), far_y = std::max(std::abs(dy), std::abs(dy - side));
-    return std::make_pair(near_x * near_x + near_y * near_y, far_x * far_x + far_y * far_y);
-  };
-  const double tile_m = kBlocksPerTileSide * block_m;
-  for (std::uint32_t t = 0; t < tiles_->tiles().size(); ++t) {
+  std::vector<std::uint32_t> looked_at = TilesAtBoundary(center, radius_m);
+  if (oldest_insertion != 0) {
+    looked_at.resize(tiles_->tiles().size());
+    std::iota(looked_at.begin(), looked_at.end(), 0u);
+  }
+  for (const std::uint32_t t : looked_at) {
     const TileMap::Tile& tile = tiles_->tile(t);
-    if (tile.blocks.empty()) continue;
-    if (oldest_insertion == 0 &&
-        distances2(tile.x * tile_m + parameters_.center_m[0], tile.y * tile_m + parameters_.center_m[1], tile_m).second <=
-            radius2)
-      continue;
     for (std::size_t i = tile.blocks.size(); i-- > 0;) {  // backwards: removal swaps the last one in
       const std::uint32_t slot = tile.blocks[i];
       const Block& candidate = blocks_[slot];
-      const Eigen::Vector3d corner = BlockCorner(slot * kCellsPerBlock);
-      const auto [nearest2, farthest2] = distances2(corner.x(), corner.y(), block_m);
+      const Eigen::Vector2d corner = BlockCorner(slot * kCellsPerBlock).head<2>();
+      const auto [nearest_m, farthest_m] = DistancesToSquare(center, corner, block_m);
       const bool is_old = candidate.last_insertion < oldest_insertion;
-      if (farthest2 <= radius2 && !is_old) continue;
-      std::uint64_t leaving = is_old ? candidate.occupied : 0;
+      if (farthest_m <= radius_m && !is_old) continue;
+      std::uint64_t leaving = is_old || nearest_m > radius_m ? candidate.occupied : 0;
       for (std::uint64_t cells = candidate.occupied & ~leaving; cells != 0; cells &= cells - 1) {
         const int cell = __builtin_ctzll(cells);
-        const Eigen::Vector3f& c = voxels_[slot][cell].centroid_block;
-        const double dx = corner.x() + c.x() - center.x(), dy = corner.y() + c.y() - center.y();
-        if (nearest2 > radius2 || dx * dx + dy * dy > radius2) leaving |= std::uint64_t{1} << cell;
+        const Eigen::Vector2d centroid = corner + voxels_[slot][cell].centroid_block.head<2>().cast<double>();
+        if ((centroid - center).squaredNorm() > radius2) leaving |= std::uint64_t{1} << cell;
       }
       RemoveCells(slot, leaving, &update);
     }
   }
   active_voxels_ -= update.removed.size();
   return update;
+}
+
+/// The tiles that a circle in the grid's x-y plane, removal's boundary, leaves out, or cuts. A tile that lies inside with some
+/// room is not looked at again before the circle has moved, or shrunk, by so much altogether.
+std::vector<std::uint32_t> DynamicVoxelGrid::TilesAtBoundary(const Eigen::Vector2d& center, double radius_m) {
+  constexpr double kRoundingM = 1e-6;
+  advance_m_ += (center - last_center_).norm() + std::max(0.0, last_radius_m_ - radius_m);
+  last_center_ = center;
+  last_radius_m_ = radius_m;
+  const double tile_m = kBlocksPerTileSide * kBlockSide * parameters_.resolution_m;
+  const Eigen::Vector2d grid_center(parameters_.center_m[0], parameters_.center_m[1]);
+  std::vector<std::uint32_t> due, at_boundary;
+  while (const std::optional<std::uint32_t> index = tiles_->TakeDue(advance_m_)) due.push_back(*index);
+  for (const std::uint32_t index : due) {
+    const TileMap::Tile& tile = tiles_->tile(index);
+    const Eigen::Vector2d corner = tile_m * Eigen::Vector2d(tile.x, tile.y) + grid_center;
+    const double room_m = radius_m - DistancesToSquare(center, corner, tile_m).farthest_m - kRoundingM;
+    if (room_m <= 0.0) at_boundary.push_back(index);
+    tiles_->PutOff(index, advance_m_ + std::max(0.0, room_m));
+  }
+  return at_boundary;
 }
 
 void DynamicVoxelGrid::RemoveCells(std::uint32_t slot, std::uint64_t cells, VoxelUpdate* update) {
@@ -474,7 +500,6 @@ void DynamicVoxelGrid::RemoveBlock(std::uint32_t slot) {
   members[removed.position_in_tile] = members.back();
   blocks_[members.back()].position_in_tile = removed.position_in_tile;
   members.pop_back();
-  if (members.empty()) tiles_->Free(removed.tile);
   free_blocks_.push_back(slot);
 }
 

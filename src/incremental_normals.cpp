@@ -146,7 +146,7 @@ void IncrementalNormals::Insert(const VoxelUpdate& update) {
   for (const MovedVoxel& moved : update.moved) {
     Masks& home = masks_[moved.voxel / kCells];
     if ((home.overdue & CellBit(moved.voxel)) != 0) continue;
-    const Position position = PositionOf(moved.voxel, moved.after_block);
+    const Position position = PositionOf(moved.voxel, grid_->CentroidInBlock(moved.voxel));
     const Position anchor = blocks_[moved.voxel / kCells].Anchor(moved.voxel % kCells);
     if ((position - anchor).xyz1.matrix().squaredNorm() <= tolerance2_units_) continue;
     home.overdue |= CellBit(moved.voxel);

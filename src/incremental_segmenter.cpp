@@ -84,7 +84,10 @@ void IncrementalSegmenter<Policy>::FollowCentroids(const std::vector<MovedVoxel>
   for (std::size_t i = 0; i < moved_voxels.size(); ++i) {
     const MovedVoxel& moved = moved_voxels[i];
     const std::uint64_t bit = CellBit(moved.voxel);
-    if (i + kAhead < moved_voxels.size()) __builtin_prefetch(&BlockOf(moved_voxels[i + kAhead].voxel));
+    if (i + kAhead < moved_voxels.size()) {
+      __builtin_prefetch(&BlockOf(moved_voxels[i + kAhead].voxel));
+      __builtin_prefetch(&grid_->CentroidInBlock(moved_voxels[i + kAhead].voxel));
+    }
     if (block != &BlockOf(moved.voxel)) {
       block = &BlockOf(moved.voxel);
       corner = grid_->BlockCorner(moved.voxel);
@@ -96,7 +99,8 @@ void IncrementalSegmenter<Policy>::FollowCentroids(const std::vector<MovedVoxel>
       cluster = &ClusterAt(FindRoot(part->label));
     }
     if (cluster->state == State::kTooLarge) continue;
-    cluster->moments.Move(corner + moved.before_block.cast<double>(), corner + moved.after_block.cast<double>());
+    cluster->moments.Move(corner + moved.before_block.cast<double>(),
+                          corner + grid_->CentroidInBlock(moved.voxel).cast<double>());
     cluster->grew = true;
     MarkDirty(cluster);
   }

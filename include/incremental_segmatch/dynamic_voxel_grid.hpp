@@ -23,13 +23,11 @@ struct DynamicVoxelGridParameters {
   std::array<double, 3> center_m{0.0, 0.0, 0.0};  ///< o of (3.3): centre of the covered volume, in the grid's frame
 };
 
-/// A voxel whose centroid moved. Coordinates are relative to the corner of the voxel's block
-/// (DynamicVoxelGrid::BlockCorner).
+/// A voxel whose centroid moved; DynamicVoxelGrid::CentroidInBlock has it as it is now.
 struct MovedVoxel {
   VoxelHandle voxel = 0;  ///< which voxel
-  /// Its centroid before, relative to the corner of its block (m).
+  /// Its centroid before, relative to the corner of its block (DynamicVoxelGrid::BlockCorner) (m).
   Eigen::Vector3f before_block = Eigen::Vector3f::Zero();
-  Eigen::Vector3f after_block = Eigen::Vector3f::Zero();  ///< its centroid now, likewise (m)
 };
 
 /// A voxel that left. Its handle is free from the next call of the grid on.
@@ -84,7 +82,7 @@ class NeighbourStencil {
 /// Everything is kept in the grid's own frame; T_odom_grid (T_g of the thesis) maps it to the world, so that a rigid
 /// transform of the whole grid (3.1.4) is one matrix product, and a later point still finds its voxel.
 ///
-/// Cost: Insert is O(points), RemoveOutside O(removed + tiles of 3.2 m in the map), with an oldest insertion O(removed +
+/// Cost: Insert is O(points), RemoveOutside O(removed + blocks at the boundary), with an oldest insertion O(removed +
 /// blocks), Transform O(1), neighbours O(voxels in the stencil). Not thread-safe.
 class DynamicVoxelGrid {
  public:
@@ -177,7 +175,7 @@ class DynamicVoxelGrid {
   struct alignas(64) Block {
     std::uint64_t occupied = 0;  ///< cells with at least one point
     std::uint64_t active = 0;    ///< cells with at least min_points_per_voxel
-    std::uint64_t touched = 0;   ///< cells that got points in the running Insert
+    std::uint64_t touched = 0;   ///< cells that got points in the last insertion
     std::uint32_t last_insertion = 0;  ///< that brought points
     std::array<std::int32_t, 3> coordinates{};
     std::uint32_t tile = 0;
@@ -204,11 +202,12 @@ class DynamicVoxelGrid {
   static void Locate(const CellTransform& transform, Chunk* chunk);
   std::size_t FindVoxels(const Chunk& chunk, Run* runs, VoxelUpdate* update);
   void AddRun(const Run& run, VoxelUpdate* update);
-  void SettleTouched(VoxelUpdate* update);
+  void ActivateTouched(VoxelUpdate* update);
   std::uint32_t FindBlock(const std::array<std::int32_t, 3>& coordinates) const;
   std::uint32_t AddBlock(const std::array<std::int32_t, 3>& coordinates);
   void RemoveBlock(std::uint32_t slot);
   void RemoveCells(std::uint32_t slot, std::uint64_t cells, VoxelUpdate* update);
+  std::vector<std::uint32_t> TilesAtBoundary(const Eigen::Vector2d& center, double radius_m);
 
   DynamicVoxelGridParameters parameters_;
   float block_size_m_ = 0.f;
@@ -221,6 +220,10 @@ class DynamicVoxelGrid {
   std::vector<std::uint32_t> free_blocks_;
   std::unique_ptr<BlockMap> block_map_;
   std::unique_ptr<TileMap> tiles_;
+  // Of RemoveOutside: the last circle, and how far its boundary has come inwards at most, over all calls.
+  Eigen::Vector2d last_center_ = Eigen::Vector2d::Zero();
+  double last_radius_m_ = 0.0;
+  double advance_m_ = 0.0;
   std::size_t active_voxels_ = 0;
   std::size_t occupied_voxels_ = 0;
   std::size_t last_moved_ = 0;  ///< in the last Insert
