@@ -19,13 +19,13 @@ class KeySet {
     slots_.assign(slots, kFree);
   }
 
-  /// False if it was there already.
+  /// False if it was there already. No branch depends on that: nobody could predict it.
   bool Add(std::uint64_t key) {
     std::size_t slot = (key * 0x9e3779b97f4a7c15u) >> 40 & (slots_.size() - 1);
-    while (slots_[slot] != kFree && slots_[slot] != key) slot = (slot + 1) & (slots_.size() - 1);
-    if (slots_[slot] == key) return false;
+    while ((slots_[slot] != kFree) & (slots_[slot] != key)) slot = (slot + 1) & (slots_.size() - 1);
+    const bool is_new = slots_[slot] != key;
     slots_[slot] = key;
-    return true;
+    return is_new;
   }
 
  private:
@@ -52,17 +52,16 @@ Points ThinScan(const Points& points_sensor, const ScanThinningParameters& param
   const float max2 = static_cast<float>(parameters.max_range_m * parameters.max_range_m);
   const float per_metre = static_cast<float>(1.0 / parameters.cell_size_m);
   KeySet cells(looked_at);
-  Points thinned;
-  std::uint64_t last = ~std::uint64_t{0};  // points that follow each other in a scan often share a cell
+  Points thinned(looked_at);
+  Eigen::Vector3f* end = thinned.data();
   for (std::size_t i = 0; i < looked_at; ++i) {
     const Eigen::Vector3f& p = points_sensor[i * points_sensor.size() / looked_at];
     const float range2 = p.head<2>().squaredNorm();
     if (!(range2 >= min2 && range2 <= max2) || !std::isfinite(p.z())) continue;
-    const std::uint64_t cell = CellOf(p, per_metre);
-    if (cell != last && cells.Add(cell)) thinned.push_back(p);
-    last = cell;
+    *end = p;  // stays if the end moves behind it
+    end += cells.Add(CellOf(p, per_metre));
   }
-  return thinned;
+  return Points(thinned.data(), end);
 }
 
 void Validate(const ScanThinningParameters& parameters) {
