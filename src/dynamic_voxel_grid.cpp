@@ -34,10 +34,21 @@ std::uint64_t PackTile(int x, int y) {
 }
 
 // Block coordinates fit 21 bits each: at most 23 bits of cells an axis, in blocks of 4.
+constexpr int kBlockBits = 21;
+
+std::uint64_t PackCoordinate(std::int32_t coordinate, int axis) {
+  return static_cast<std::uint64_t>(static_cast<std::uint32_t>(coordinate) & ((1u << kBlockBits) - 1)) << (kBlockBits * axis);
+}
+
 std::uint64_t PackBlock(const std::array<std::int32_t, 3>& c) {
-  constexpr std::uint64_t kMask = (1u << 21) - 1;
-  return ((static_cast<std::uint64_t>(c[2]) & kMask) << 42) | ((static_cast<std::uint64_t>(c[1]) & kMask) << 21) |
-         (static_cast<std::uint64_t>(c[0]) & kMask);
+  return PackCoordinate(c[0], 0) | PackCoordinate(c[1], 1) | PackCoordinate(c[2], 2);
+}
+
+std::array<std::int32_t, 3> UnpackBlock(std::uint64_t key) {
+  const auto coordinate = [key](int axis) {  // its sign is its highest bit
+    return static_cast<std::int32_t>(static_cast<std::uint32_t>(key >> (kBlockBits * axis)) << (32 - kBlockBits)) >> (32 - kBlockBits);
+  };
+  return {coordinate(0), coordinate(1), coordinate(2)};
 }
 
 struct SquareDistances {
@@ -228,7 +239,7 @@ struct DynamicVoxelGrid::Chunk {
   std::size_t count = 0;
   std::array<std::array<float, kSize>, 3> points_sensor;
   std::array<std::array<float, kSize>, 3> in_block;          ///< relative to the corner of their block
-  std::array<std::array<std::int32_t, kSize>, 3> coordinates;  ///< of their block
+  std::array<std::uint64_t, kSize> block;  ///< as PackBlock has it
   std::array<std::uint32_t, kSize> cell;
   std::array<std::uint32_t, kSize> inside;  ///< 0 for points that have no voxel
 };
@@ -254,8 +265,7 @@ VoxelUpdate DynamicVoxelGrid::Insert(const Points& points_sensor, const Pose& T_
     for (std::size_t i = 0; i < chunk.count; ++i)
       for (int axis = 0; axis < 3; ++axis) chunk.points_sensor[axis][i] = points_sensor[begin + i][axis];
     Locate(transform, &chunk);
-    for (std::size_t i = 0; i < chunk.count; ++i)
-      block_map_->Prefetch(PackBlock({chunk.coordinates[0][i], chunk.coordinates[1][i], chunk.coordinates[2][i]}));
+    for (std::size_t i = 0; i < chunk.count; ++i) block_map_->Prefetch(chunk.block[i]);
     const std::size_t count = FindVoxels(chunk, runs.data(), &update);
     for (std::size_t i = 0; i < count; ++i) AddRun(runs[i], &update);
   }
@@ -287,20 +297,21 @@ void DynamicVoxelGrid::Locate(const CellTransform& transform, Chunk* chunk) {
   const float* const z = chunk->points_sensor[2].data();
   std::uint32_t* const cell = chunk->cell.data();
   std::uint32_t* const inside = chunk->inside.data();
+  std::uint64_t* const block = chunk->block.data();
+  for (std::size_t i = 0; i < count; ++i) block[i] = 0;
   for (std::size_t i = 0; i < count; ++i) cell[i] = 0;
   for (std::size_t i = 0; i < count; ++i) inside[i] = 1;
   for (int axis = 0; axis < 3; ++axis) {
     const double rx = transform.R[axis][0], ry = transform.R[axis][1], rz = transform.R[axis][2], t = transform.t[axis];
     const double low = -transform.half_cells[axis], high = transform.half_cells[axis];
     float* const in_block = chunk->in_block[axis].data();
-    std::int32_t* const coordinate = chunk->coordinates[axis].data();
     for (std::size_t i = 0; i < count; ++i) {
       const double exact = rx * static_cast<double>(x[i]) + ry * static_cast<double>(y[i]) + rz * static_cast<double>(z[i]) + t;
       double cells = exact >= low ? exact : low;  // also where it is no number
       cells = cells < high ? cells : low;
       std::int32_t index = static_cast<std::int32_t>(cells);
       index -= cells < static_cast<double>(index) ? 1 : 0;  // floor
-      coordinate[i] = index >> 2;
+      block[i] |= PackCoordinate(index >> 2, axis);
       cell[i] |= static_cast<std::uint32_t>(index & 3) << (2 * axis);
       inside[i] &= cells == exact ? 1u : 0u;
       in_block[i] = static_cast<float>(cells - static_cast<double>(index & ~3)) * transform.resolution;
@@ -310,7 +321,8 @@ void DynamicVoxelGrid::Locate(const CellTransform& transform, Chunk* chunk) {
 
 /// Finds or adds the block of each point that has one, drops the others, and returns how many runs there are.
 std::size_t DynamicVoxelGrid::FindVoxels(const Chunk& chunk, Run* runs, VoxelUpdate* update) {
-  std::array<std::int32_t, 3> last{std::numeric_limits<std::int32_t>::min(), 0, 0};
+  constexpr std::uint64_t kNone = ~std::uint64_t{0};
+  std::uint64_t last = kNone;
   std::uint32_t slot = kNoBlock;
   Run* run = runs - 1;
   for (std::size_t i = 0; i < chunk.count; ++i) {
@@ -321,11 +333,10 @@ std::size_t DynamicVoxelGrid::FindVoxels(const Chunk& chunk, Run* runs, VoxelUpd
       continue;
     }
     const Eigen::Vector3f in_block(chunk.in_block[0][i], chunk.in_block[1][i], chunk.in_block[2][i]);
-    const std::array<std::int32_t, 3> coordinates{chunk.coordinates[0][i], chunk.coordinates[1][i], chunk.coordinates[2][i]};
-    if (coordinates != last) {
-      slot = block_map_->Find(PackBlock(coordinates));
-      if (slot == kNoBlock) slot = AddBlock(coordinates);
-      last = coordinates;
+    if (chunk.block[i] != last) {
+      last = chunk.block[i];
+      slot = block_map_->Find(last);
+      if (slot == kNoBlock) slot = AddBlock(UnpackBlock(last));
     } else if (run->cell == chunk.cell[i]) {
       ++run->count;
       run->sum_block += in_block;
