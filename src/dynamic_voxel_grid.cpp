@@ -235,19 +235,27 @@ DynamicVoxelGrid& DynamicVoxelGrid::operator=(DynamicVoxelGrid&&) noexcept = def
 /// A chunk of points on their way into their voxels, by coordinate, so that compilers take several points at a time.
 struct DynamicVoxelGrid::Chunk {
   static constexpr std::size_t kSize = 128;
+  static constexpr std::uint64_t kNowhere = ~std::uint64_t{0};  ///< block of points that have no voxel
 
   std::size_t count = 0;
   std::array<std::array<float, kSize>, 3> points_sensor;
-  std::array<std::array<float, kSize>, 3> in_block;          ///< relative to the corner of their block
-  std::array<std::uint64_t, kSize> block;  ///< as PackBlock has it
+  std::array<std::array<float, kSize>, 3> in_block;  ///< relative to the corner of their block
+  std::array<std::uint64_t, kSize> block;            ///< as PackBlock has it
   std::array<std::uint32_t, kSize> cell;
-  std::array<std::uint32_t, kSize> inside;  ///< 0 for points that have no voxel
 };
 
-/// Points of one voxel that follow each other in the scan.
-struct DynamicVoxelGrid::Run {
-  std::uint32_t slot, cell, count;
-  Eigen::Vector3f sum_block;
+/// A chunk's points of one voxel that follow each other, as one.
+struct DynamicVoxelGrid::Runs {
+  struct Run {
+    Eigen::Vector3f sum_block = Eigen::Vector3f::Zero();
+    std::uint32_t count = 0;
+    std::uint32_t cell = 0;
+    std::uint32_t visit = 0;  ///< of its block, in the next two
+  };
+  std::size_t count = 0, visits = 0;
+  std::array<Run, Chunk::kSize> runs;
+  std::array<std::uint64_t, Chunk::kSize> block;
+  std::array<std::uint32_t, Chunk::kSize> slot;
 };
 
 VoxelUpdate DynamicVoxelGrid::Insert(const Points& points_sensor, const Pose& T_odom_sensor) {
@@ -256,7 +264,7 @@ VoxelUpdate DynamicVoxelGrid::Insert(const Points& points_sensor, const Pose& T_
   VoxelUpdate update;
   ++insertions_;
   Chunk chunk;
-  std::array<Run, Chunk::kSize> runs;
+  Runs runs;
   const CellTransform transform = CellTransformOf(T_odom_sensor);
   touched_inactive_.clear();
   update.moved.reserve(last_moved_ + last_moved_ / 8);
@@ -265,9 +273,10 @@ VoxelUpdate DynamicVoxelGrid::Insert(const Points& points_sensor, const Pose& T_
     for (std::size_t i = 0; i < chunk.count; ++i)
       for (int axis = 0; axis < 3; ++axis) chunk.points_sensor[axis][i] = points_sensor[begin + i][axis];
     Locate(transform, &chunk);
-    for (std::size_t i = 0; i < chunk.count; ++i) block_map_->Prefetch(chunk.block[i]);
-    const std::size_t count = FindVoxels(chunk, runs.data(), &update);
-    for (std::size_t i = 0; i < count; ++i) AddRun(runs[i], &update);
+    CountDropped(chunk, &update);
+    MergeRuns(chunk, &runs);
+    FindBlocks(&runs);
+    AddRuns(runs, &update);
   }
   ActivateTouched(&update);
   last_moved_ = update.moved.size();
@@ -296,7 +305,7 @@ void DynamicVoxelGrid::Locate(const CellTransform& transform, Chunk* chunk) {
   const float* const y = chunk->points_sensor[1].data();
   const float* const z = chunk->points_sensor[2].data();
   std::uint32_t* const cell = chunk->cell.data();
-  std::uint32_t* const inside = chunk->inside.data();
+  std::array<std::uint32_t, Chunk::kSize> inside;
   std::uint64_t* const block = chunk->block.data();
   for (std::size_t i = 0; i < count; ++i) block[i] = 0;
   for (std::size_t i = 0; i < count; ++i) cell[i] = 0;
@@ -317,64 +326,89 @@ void DynamicVoxelGrid::Locate(const CellTransform& transform, Chunk* chunk) {
       in_block[i] = static_cast<float>(cells - static_cast<double>(index & ~3)) * transform.resolution;
     }
   }
+  for (std::size_t i = 0; i < count; ++i) block[i] |= std::uint64_t{inside[i]} - 1;  // kNowhere, or nothing
 }
 
-/// Finds or adds the block of each point that has one, drops the others, and returns how many runs there are.
-std::size_t DynamicVoxelGrid::FindVoxels(const Chunk& chunk, Run* runs, VoxelUpdate* update) {
-  constexpr std::uint64_t kNone = ~std::uint64_t{0};
-  std::uint64_t last = kNone;
-  std::uint32_t slot = kNoBlock;
-  Run* run = runs - 1;
+void DynamicVoxelGrid::CountDropped(const Chunk& chunk, VoxelUpdate* update) {
   for (std::size_t i = 0; i < chunk.count; ++i) {
-    if (!chunk.inside[i]) {
-      const bool finite = std::isfinite(chunk.points_sensor[0][i]) && std::isfinite(chunk.points_sensor[1][i]) &&
-                          std::isfinite(chunk.points_sensor[2][i]);
-      ++(finite ? update->dropped_outside : update->dropped_nonfinite);
-      continue;
-    }
-    const Eigen::Vector3f in_block(chunk.in_block[0][i], chunk.in_block[1][i], chunk.in_block[2][i]);
-    if (chunk.block[i] != last) {
-      last = chunk.block[i];
-      slot = block_map_->Find(last);
-      if (slot == kNoBlock) slot = AddBlock(UnpackBlock(last));
-    } else if (run->cell == chunk.cell[i]) {
-      ++run->count;
-      run->sum_block += in_block;
-      continue;
-    }
-    *++run = {slot, chunk.cell[i], 1, in_block};
-    __builtin_prefetch(&blocks_[slot], 1);
-    __builtin_prefetch(&voxels_[slot][chunk.cell[i]], 1);
+    if (chunk.block[i] != Chunk::kNowhere) continue;
+    const bool finite = std::isfinite(chunk.points_sensor[0][i]) && std::isfinite(chunk.points_sensor[1][i]) &&
+                        std::isfinite(chunk.points_sensor[2][i]);
+    ++(finite ? update->dropped_outside : update->dropped_nonfinite);
   }
-  return static_cast<std::size_t>(run + 1 - runs);
+}
+
+/// Where runs end nobody can predict, so that no branch depends on it.
+void DynamicVoxelGrid::MergeRuns(const Chunk& chunk, Runs* runs) {
+  std::size_t count = 0, visits = 0;
+  std::uint64_t last_block = chunk.block[0];
+  std::uint32_t last_cell = chunk.cell[0];
+  Eigen::Vector3f sum = Eigen::Vector3f::Zero();
+  std::uint32_t begin = 0;
+  for (std::size_t i = 0; i < chunk.count; ++i) {
+    const std::uint64_t block_change = chunk.block[i] ^ last_block;
+    const std::uint32_t leaves_block = block_change != 0;
+    const std::uint32_t leaves_voxel = (block_change | (chunk.cell[i] ^ last_cell)) != 0;
+    count += leaves_voxel;
+    visits += leaves_block;
+    begin += leaves_voxel * (static_cast<std::uint32_t>(i) - begin);
+    sum = static_cast<float>(1 - leaves_voxel) * sum + Eigen::Vector3f(chunk.in_block[0][i], chunk.in_block[1][i], chunk.in_block[2][i]);
+    last_block = chunk.block[i];
+    last_cell = chunk.cell[i];
+    runs->block[visits] = last_block;
+    runs->runs[count] = {sum, static_cast<std::uint32_t>(i) + 1 - begin, last_cell, static_cast<std::uint32_t>(visits)};
+  }
+  runs->count = count + 1;
+  runs->visits = visits + 1;
+}
+
+/// Finds or adds the blocks.
+void DynamicVoxelGrid::FindBlocks(Runs* runs) {
+  for (std::size_t i = 0; i < runs->visits; ++i) block_map_->Prefetch(runs->block[i]);
+  for (std::size_t i = 0; i < runs->visits; ++i) {
+    const std::uint64_t block = runs->block[i];
+    runs->slot[i] = kNoBlock;
+    if (block == Chunk::kNowhere) continue;
+    std::uint32_t slot = block_map_->Find(block);
+    if (slot == kNoBlock) slot = AddBlock(UnpackBlock(block));
+    runs->slot[i] = slot;
+    __builtin_prefetch(&blocks_[slot], 1);
+  }
 }
 
 /// (3.4).
-void DynamicVoxelGrid::AddRun(const Run& run, VoxelUpdate* update) {
-  Block& home = blocks_[run.slot];
-  Voxel& voxel = voxels_[run.slot][run.cell];
-  const std::uint64_t bit = std::uint64_t{1} << run.cell;
-  if (home.last_insertion != insertions_) {
-    home.last_insertion = insertions_;
-    home.touched = 0;
-  }
-  if (!(home.touched & bit)) {
-    home.touched |= bit;
-    const VoxelHandle handle = run.slot * kCellsPerBlock + run.cell;
-    if (home.active & bit) {
-      update->moved.push_back({handle, voxel.centroid_block});
-    } else {
-      touched_inactive_.push_back(handle);
-      if (!(home.occupied & bit)) {
-        home.occupied |= bit;
-        voxel = {Eigen::Vector3f::Zero(), 0};
-        ++occupied_voxels_;
+void DynamicVoxelGrid::AddRuns(const Runs& runs, VoxelUpdate* update) {
+  const auto end = runs.runs.begin() + static_cast<std::ptrdiff_t>(runs.count);
+  for (auto run = runs.runs.begin(); run != end; ++run)
+    if (runs.slot[run->visit] != kNoBlock) __builtin_prefetch(&voxels_[runs.slot[run->visit]][run->cell], 1);
+  for (auto run = runs.runs.begin(); run != end; ++run) {
+    const std::uint32_t slot = runs.slot[run->visit];
+    if (slot == kNoBlock) continue;
+    Block& home = blocks_[slot];
+    Voxel& voxel = voxels_[slot][run->cell];
+    const std::uint64_t bit = std::uint64_t{1} << run->cell;
+    if (home.last_insertion != insertions_) {
+      home.last_insertion = insertions_;
+      home.touched = 0;
+    }
+    if (!(home.touched & bit)) {
+      home.touched |= bit;
+      const VoxelHandle handle = slot * kCellsPerBlock + run->cell;
+      if (home.active & bit) {
+        update->moved.push_back({handle, voxel.centroid_block});
+      } else {
+        touched_inactive_.push_back(handle);
+        if (!(home.occupied & bit)) {
+          home.occupied |= bit;
+          voxel = {Eigen::Vector3f::Zero(), 0};
+          ++occupied_voxels_;
+        }
       }
     }
+    const float n = static_cast<float>(voxel.count);
+    voxel.count += run->count;
+    voxel.centroid_block = (n * voxel.centroid_block + run->sum_block) * (1.f / static_cast<float>(voxel.count));
   }
-  const float n = static_cast<float>(voxel.count);
-  voxel.count += run.count;
-  voxel.centroid_block = (n * voxel.centroid_block + run.sum_block) * (1.f / static_cast<float>(voxel.count));
 }
 
 void DynamicVoxelGrid::ActivateTouched(VoxelUpdate* update) {

@@ -197,11 +197,13 @@ class DynamicVoxelGrid {
     float resolution;
   };
   struct Chunk;
-  struct Run;
+  struct Runs;
   CellTransform CellTransformOf(const Pose& T_odom_sensor) const;
   static void Locate(const CellTransform& transform, Chunk* chunk);
-  std::size_t FindVoxels(const Chunk& chunk, Run* runs, VoxelUpdate* update);
-  void AddRun(const Run& run, VoxelUpdate* update);
+  static void CountDropped(const Chunk& chunk, VoxelUpdate* update);
+  static void MergeRuns(const Chunk& chunk, Runs* runs);
+  void FindBlocks(Runs* runs);
+  void AddRuns(const Runs& runs, VoxelUpdate* update);
   void ActivateTouched(VoxelUpdate* update);
   std::uint32_t FindBlock(const std::array<std::int32_t, 3>& coordinates) const;
   std::uint32_t AddBlock(const std::array<std::int32_t, 3>& coordinates);
