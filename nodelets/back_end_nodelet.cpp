@@ -108,6 +108,7 @@ void BackEndNodelet::Start() {
       StartOver();
     } catch (const std::exception& error) {
       back_end_.reset();
+      why_not_started_ = error.what();
       NODELET_FATAL("the back end does not start: %s", error.what());
     }
   });
@@ -179,7 +180,8 @@ void BackEndNodelet::StartOver() {
 bool BackEndNodelet::OnSaveMap(SaveMap::Request& request, SaveMap::Response& response) {
   try {
     response.segments = worker_->Run([this, path = request.path] {
-      if (!back_end_) throw std::runtime_error("the back end has not started");
+      RequireStarted();
+      RequireWholePath(path);
       back_end_->map().Save(path);
       return static_cast<std::uint32_t>(back_end_->map().segments().size());
     });
@@ -195,6 +197,7 @@ bool BackEndNodelet::OnSaveMap(SaveMap::Request& request, SaveMap::Response& res
 bool BackEndNodelet::OnLoadMap(LoadMap::Request& request, LoadMap::Response& response) {
   try {
     response.segments = worker_->Run([this, path = request.path] {
+      RequireWholePath(path);
       back_end_ = std::make_unique<BackEnd>(core_parameters_, TargetMap::Load(path, core_parameters_.target_map));
       robots_.clear();
       closures_.clear();
@@ -219,6 +222,10 @@ bool BackEndNodelet::OnReset(std_srvs::Trigger::Request& /*request*/, std_srvs::
     response.message = error.what();
   }
   return true;
+}
+
+void BackEndNodelet::RequireStarted() const {
+  if (!back_end_) throw std::invalid_argument("the back end has not started: " + why_not_started_);
 }
 
 /// Everybody forgets everything: the front ends first, so that nothing of before comes after.
@@ -259,7 +266,7 @@ bool BackEndNodelet::OnTrigger(std_srvs::Trigger::Request& /*request*/, std_srvs
 /// Attempts a recognition for every robot that tracks segments, and publishes it, however recent the last one is. In
 /// words, what came of it.
 std::string BackEndNodelet::RecognizeAgain(bool* recognized) {
-  if (!back_end_) throw std::runtime_error("the back end has not started");
+  RequireStarted();
   if (robots_.empty()) throw std::runtime_error("no segments have come from any robot yet");
   std::string words;
   for (auto& [session, robot] : robots_) {
@@ -281,7 +288,7 @@ void BackEndNodelet::Change(const BackEndConfig& config) {
   NodeletParameters<BackEndNodeParameters> parameters{parameters_, Parameters()};
   parameters.core.back_end = core_parameters_;
   try {
-    if (!back_end_) throw std::invalid_argument("the back end has not started");
+    RequireStarted();
     parameters = WithConfig(std::move(parameters), config);
     back_end_->ChangeParameters(parameters.core.back_end);
   } catch (const std::invalid_argument& error) {
@@ -294,7 +301,7 @@ void BackEndNodelet::Change(const BackEndConfig& config) {
 }
 
 void BackEndNodelet::ProcessSegments(const SegmentArray& message, const std::string& topic) {
-  if (!back_end_) return;
+  RequireStarted();
   const RobotSessions::Session session =
       sessions_.Find(message.robot, message.session, ToStampNs(message.header.stamp));
   if (session.change == RobotSessions::Change::kEnded) return;

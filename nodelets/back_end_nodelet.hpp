@@ -100,6 +100,7 @@ class BackEndNodelet : public nodelet::Nodelet {
 
   // In the worker's thread.
   void StartOver();
+  void RequireStarted() const;
   std::string Reset();
   std::string RecognizeAgain(bool* recognized);
   void Change(const BackEndConfig& config);
@@ -160,6 +161,7 @@ class BackEndNodelet : public nodelet::Nodelet {
 
   // Owned by the worker's thread.
   std::unique_ptr<BackEnd> back_end_;
+  std::string why_not_started_;
   std::unique_ptr<ClosureLog> closure_log_;
   RobotSessions sessions_;
   std::map<std::string, Robot> robots_;  // by session

@@ -37,18 +37,27 @@ bool IsClockMissing() {
   return ros::Time::isSimTime() && ros::Time::now().isZero();
 }
 
-/// Topics on which others publish clouds now, as words.
-std::string CloudTopics() {
+/// Clouds that nodelets of ours show, which nobody wants for input.
+bool IsDisplay(const std::string& topic) {
+  const std::string name = topic.substr(topic.rfind('/') + 1);
+  return name == "local_cloud" || name == "target_segments";
+}
+
+/// In words, why no publisher of a topic is connected: what is on it, and where there are messages of its type.
+std::string WhyNobodyPublishes(const std::string& topic, const std::string& type) {
   ros::master::V_TopicInfo topics;
-  if (!ros::master::getTopics(topics)) return "the master does not answer";
-  ros::V_string own;
-  ros::this_node::getAdvertisedTopics(own);
-  std::string list;
-  for (const ros::master::TopicInfo& topic : topics)
-    if (std::find(own.begin(), own.end(), topic.name) == own.end() &&
-        topic.datatype == ros::message_traits::datatype<sensor_msgs::PointCloud2>())
-      list += (list.empty() ? "" : ", ") + topic.name;
-  return list.empty() ? "no PointCloud2 is published at all" : "PointCloud2 is published on: " + list;
+  if (!ros::master::getTopics(topics)) return "nobody publishes " + topic + "; the master does not answer";
+  std::string type_there, elsewhere;
+  for (const ros::master::TopicInfo& other : topics) {
+    if (other.name == topic)
+      type_there = other.datatype;
+    else if (other.datatype == type && !IsDisplay(other.name))
+      elsewhere += (elsewhere.empty() ? "" : ", ") + other.name;
+  }
+  const std::string message = type.substr(type.find('/') + 1);
+  return (type_there.empty() || type_there == type ? "nobody publishes " + topic
+                                                   : topic + " has " + type_there + ", not " + message) +
+         "; " + (elsewhere.empty() ? "no " + message + " is published at all" : message + " is published on: " + elsewhere);
 }
 
 }  // namespace
@@ -58,6 +67,7 @@ FrontEndNodelet::~FrontEndNodelet() {
   cloud_subscriber_.shutdown();
   pose_subscriber_.shutdown();
   trajectory_subscriber_.shutdown();
+  corrected_odometry_subscriber_.shutdown();
   full_state_service_.shutdown();
   reset_service_.shutdown();
   diagnostics_timer_.stop();
@@ -95,8 +105,11 @@ void FrontEndNodelet::Start() {
     pose_subscriber_ = nh.subscribe("odometry", 200, &FrontEndNodelet::OnOdometry, this);
   if (parameters_.pose_source == PoseSource::kPose)
     pose_subscriber_ = nh.subscribe("pose", 200, &FrontEndNodelet::OnPose, this);
-  if (parameters_.frame_jumps)
+  if (parameters_.frame_jumps) {
     trajectory_subscriber_ = nh.subscribe("trajectory", 1, &FrontEndNodelet::OnTrajectory, this);
+    corrected_odometry_subscriber_ =
+        nh.subscribe("corrected_odometry", 1, &FrontEndNodelet::OnCorrectedOdometry, this);
+  }
   cloud_subscriber_ = nh.subscribe("points", kCallbackQueue, &FrontEndNodelet::OnCloud, this);
 
   diagnostics_ = std::make_unique<diagnostic_updater::Updater>(nh, getPrivateNodeHandle(), getName());
@@ -153,6 +166,16 @@ void FrontEndNodelet::OnPose(const geometry_msgs::PoseStampedConstPtr& pose) {
 void FrontEndNodelet::OnTrajectory(const nav_msgs::PathConstPtr& path) {
   const std::lock_guard<std::mutex> lock(mutex_);
   trajectory_ = path;
+}
+
+/// A trajectory of one pose.
+void FrontEndNodelet::OnCorrectedOdometry(const nav_msgs::OdometryConstPtr& odometry) {
+  const auto path = boost::make_shared<nav_msgs::Path>();
+  path->header = odometry->header;
+  path->poses.resize(1);
+  path->poses[0].header = odometry->header;
+  path->poses[0].pose = odometry->pose.pose;
+  OnTrajectory(path);
 }
 
 bool FrontEndNodelet::OnRequestFullState(RequestFullState::Request& /*request*/, RequestFullState::Response& response) {
@@ -269,6 +292,12 @@ void FrontEndNodelet::FollowTrajectory(const ros::Time& stamp, Clock::time_point
 
 /// The newest pose of the trajectory that was used for a cloud tells whether the frame has jumped since.
 void FrontEndNodelet::FollowJump(const nav_msgs::Path& path) {
+  if (FrameName(path.header.frame_id) != FrameName(parameters_.odom_frame)) {
+    if (throttle_.IsDue("trajectory", kWarnPeriod_s))
+      NODELET_WARN("the trajectory is in frame %s, but the frame that jumps is %s (odom_frame): it is not followed",
+                   path.header.frame_id.c_str(), parameters_.odom_frame.c_str());
+    return;
+  }
   for (auto corrected = path.poses.rbegin(); corrected != path.poses.rend(); ++corrected) {
     const StampNs stamp_ns = ToStampNs(corrected->header.stamp);
     const auto used = std::find_if(history_.rbegin(), history_.rend(), [stamp_ns](const StampedPose& pose) {
@@ -359,22 +388,35 @@ void FrontEndNodelet::Change(const FrontEndConfig& config) {
   NODELET_INFO("the parameters have changed");
 }
 
+bool FrontEndNodelet::IsTrajectoryMissing() const {
+  return parameters_.frame_jumps &&
+         trajectory_subscriber_.getNumPublishers() + corrected_odometry_subscriber_.getNumPublishers() == 0;
+}
+
 /// In words, why nothing can come; empty if that is not known.
 std::string FrontEndNodelet::WhatIsMissing() const {
+  using ros::message_traits::datatype;
   if (IsClockMissing())
     return "/use_sim_time is set, but nobody publishes /clock: play the bag with --clock, or unset it";
   if (cloud_subscriber_.getNumPublishers() == 0)
-    return "nobody publishes " + cloud_subscriber_.getTopic() + "; " + CloudTopics();
+    return WhyNobodyPublishes(cloud_subscriber_.getTopic(), datatype<sensor_msgs::PointCloud2>());
   if (parameters_.pose_source != PoseSource::kTf && pose_subscriber_.getNumPublishers() == 0)
-    return "nobody publishes " + pose_subscriber_.getTopic() + ", from which the sensor's poses are to come";
+    return "no poses of the sensor: " +
+           WhyNobodyPublishes(pose_subscriber_.getTopic(), parameters_.pose_source == PoseSource::kOdometry
+                                                               ? datatype<nav_msgs::Odometry>()
+                                                               : datatype<geometry_msgs::PoseStamped>());
+  if (IsTrajectoryMissing())
+    return "no jump of " + parameters_.odom_frame + " will be followed (frame_jumps): nobody publishes " +
+           corrected_odometry_subscriber_.getTopic() + ", and " +
+           WhyNobodyPublishes(trajectory_subscriber_.getTopic(), datatype<nav_msgs::Path>());
   return "";
 }
 
-/// A reminder in the log, as long as nothing has come at all, or no clock.
+/// A reminder in the log, as long as nothing has come at all, or no clock, or jumps would be missed.
 void FrontEndNodelet::SayWhatIsMissing() {
   {
     const std::lock_guard<std::mutex> lock(mutex_);
-    if (status_.processed > 0 && !IsClockMissing()) return;
+    if (status_.processed > 0 && !IsClockMissing() && !IsTrajectoryMissing()) return;
   }
   if (!throttle_.IsDue("missing", kMissingPeriod_s)) return;
   const std::string missing = WhatIsMissing();
@@ -391,10 +433,14 @@ void FrontEndNodelet::Diagnose(diagnostic_updater::DiagnosticStatusWrapper& stat
   for (const auto& [kind, count] : status_.skipped) skipped += count;
   const double rate_hz = static_cast<double>(status_.processed - status_.reported_processed) / elapsed_s;
 
-  if (!missing.empty() && (status_.received == status_.reported_received || IsClockMissing()))
+  const std::size_t dropped = worker_->dropped();
+  if (!missing.empty() && (status_.received == status_.reported_received || IsClockMissing() || IsTrajectoryMissing()))
     status.summary(DiagnosticStatus::WARN, missing);
   else if (skipped != status_.reported_skipped)
     status.summary(DiagnosticStatus::WARN, "scans are skipped: " + status_.last_skip);
+  else if (dropped != status_.reported_dropped)
+    status.summaryf(DiagnosticStatus::WARN, "%.1f scans/s, and %zu dropped since the last report: they come faster", rate_hz,
+                    dropped - status_.reported_dropped);
   else if (parameters_.registered && status_.distance_m > kCoarseFloatDistance_m)
     status.summary(DiagnosticStatus::WARN,
                    "so far from the origin, registered float clouds are coarse: publish doubles");
@@ -407,7 +453,7 @@ void FrontEndNodelet::Diagnose(diagnostic_updater::DiagnosticStatusWrapper& stat
   status.add("scans processed", status_.processed);
   status.addf("scans per second", "%.1f", rate_hz);
   status.add("scans waiting", worker_->queued());
-  status.add("scans dropped by the full queue", worker_->dropped());
+  status.add("scans dropped by the full queue", dropped);
   for (const auto& [kind, count] : status_.skipped) status.add("scans skipped: " + kind, count);
   status.add("starts over", status_.restarts);
   status.addf("stamps behind ROS time [s]", "%.3f", status_.stamp_age_s);
@@ -420,6 +466,7 @@ void FrontEndNodelet::Diagnose(diagnostic_updater::DiagnosticStatusWrapper& stat
   status_.reported_received = status_.received;
   status_.reported_processed = status_.processed;
   status_.reported_skipped = skipped;
+  status_.reported_dropped = dropped;
 }
 
 }  // namespace incremental_segmatch

@@ -34,7 +34,7 @@ namespace incremental_segmatch {
 /// poses and publishes. Bad scans are skipped, counted and explained (log, diagnostics); a wrong parameter is FATAL,
 /// and the nodelet then stays idle.
 ///
-/// Subscribes `points`; `odometry` or `pose` if that is the source of poses; `trajectory` if odom jumps. Publishes
+/// Subscribes `points`; `odometry` or `pose` if that is the source of poses; `trajectory` and `corrected_odometry` if odom jumps. Publishes
 /// `segments`, `local_cloud` (coloured by segment) and `local_labels` (IDs), `front_end_steps`, diagnostics. Serves
 /// `<segments>/request_full_state` and `<segments>/reset`, and dynamic_reconfigure below `~tuning`. Says what is
 /// missing while nothing comes.
@@ -58,9 +58,10 @@ class FrontEndNodelet : public nodelet::Nodelet {
     double distance_m = 0.0;            ///< of the sensor from odom's origin
     double stamp_age_s = 0.0;           ///< ROS time minus the last cloud's stamp, when it came
     double latency_ms = 0.0;            ///< from the last cloud's arrival to its segments
-    std::size_t reported_received = 0;  ///< at the last report, as the next two
+    std::size_t reported_received = 0;  ///< at the last report, as the next three
     std::size_t reported_processed = 0;
     std::size_t reported_skipped = 0;
+    std::size_t reported_dropped = 0;
     Clock::time_point reported = Clock::now();
   };
 
@@ -70,9 +71,11 @@ class FrontEndNodelet : public nodelet::Nodelet {
   void OnOdometry(const nav_msgs::OdometryConstPtr& odometry);
   void OnPose(const geometry_msgs::PoseStampedConstPtr& pose);
   void OnTrajectory(const nav_msgs::PathConstPtr& path);
+  void OnCorrectedOdometry(const nav_msgs::OdometryConstPtr& odometry);
   bool OnRequestFullState(RequestFullState::Request& request, RequestFullState::Response& response);
   bool OnReset(std_srvs::Trigger::Request& request, std_srvs::Trigger::Response& response);
   void Diagnose(diagnostic_updater::DiagnosticStatusWrapper& status);
+  bool IsTrajectoryMissing() const;
   std::string WhatIsMissing() const;
   void SayWhatIsMissing();
 
@@ -96,6 +99,7 @@ class FrontEndNodelet : public nodelet::Nodelet {
   ros::Subscriber cloud_subscriber_;
   ros::Subscriber pose_subscriber_;  // of odometry or poses
   ros::Subscriber trajectory_subscriber_;
+  ros::Subscriber corrected_odometry_subscriber_;
   ros::Publisher segments_publisher_;
   ros::Publisher local_cloud_publisher_;
   ros::Publisher labels_publisher_;

@@ -2,6 +2,7 @@
 
 #include <cmath>
 #include <cstdio>
+#include <filesystem>
 #include <set>
 #include <stdexcept>
 #include <type_traits>
@@ -58,6 +59,16 @@ class SubtreeReader {
       known += (known.empty() ? "" : ", ") + choice;
     }
     throw std::invalid_argument("parameter " + Full(name) + ": " + word + " is none of: " + known);
+  }
+
+  /// A path, empty for none.
+  void ReadPath(const std::string& name, std::string& path) {
+    Read(name, path);
+    try {
+      if (!path.empty()) RequireWholePath(path);
+    } catch (const std::invalid_argument& error) {
+      Require(false, name, error.what());
+    }
   }
 
   /// The subtree's value, null if it is not set.
@@ -132,7 +143,7 @@ SubtreeReader ReadTree(const ros::NodeHandle& private_nh) {
 /// The core's parameters from `config_file`, or from the given subtree. A file may hold both sides' parameters.
 Parameters ReadCore(SubtreeReader& reader, const std::string& subtree_name) {
   std::string config_file;
-  reader.Read("config_file", config_file);
+  reader.ReadPath("config_file", config_file);
   const XmlRpcValue* subtree = reader.Take(subtree_name);
   if (!config_file.empty() && subtree != nullptr)
     throw std::invalid_argument("parameters " + reader.Full("config_file") + " and " + reader.Full(subtree_name) +
@@ -194,8 +205,8 @@ NodeletParameters<BackEndNodeParameters> ReadBackEndParameters(const ros::NodeHa
   reader.Read("trajectory_kind", node.trajectory_kind, kFrameKinds);
   reader.Read("closure_min_distance_m", node.closure_min_distance_m);
   reader.Read("closure_min_interval_s", node.closure_min_interval_s);
-  reader.Read("map_file", node.map_file);
-  reader.Read("output_dir", node.output_dir);
+  reader.ReadPath("map_file", node.map_file);
+  reader.ReadPath("output_dir", node.output_dir);
   reader.Read("publish_tf", node.publish_tf);
   reader.Read("tf_tolerance_s", node.tf_tolerance_s);
   reader.Read("display_period_s", node.display_period_s);
@@ -217,7 +228,7 @@ PoseGraphNodeParameters ReadPoseGraphParameters(const ros::NodeHandle& private_n
   reader.Read("trajectory_kind", node.trajectory_kind, kFrameKinds);
   reader.Read("publish_tf", node.publish_tf);
   reader.Read("tf_tolerance_s", node.tf_tolerance_s);
-  reader.Read("output_dir", node.output_dir);
+  reader.ReadPath("output_dir", node.output_dir);
   reader.Read("queue_size", node.queue_size);
   ReadPoseGraph(reader.Take("pose_graph"), reader.Full("pose_graph"), node.pose_graph);
   reader.RefuseOthers();
@@ -251,6 +262,13 @@ void Validate(const BackEndNodeParameters& node, const std::string& path) {
   require(node.tf_tolerance_s >= 0.0, "tf_tolerance_s", "must not be negative");
   require(node.display_period_s >= 0.0, "display_period_s", "must not be negative");
   require(node.queue_size > 0, "queue_size", "must be at least 1");
+}
+
+void RequireWholePath(const std::string& path) {
+  if (path.empty()) throw std::invalid_argument("no path is given");
+  if (path.front() != '/')
+    throw std::invalid_argument(path + " is no whole path, and this node runs in " +
+                                std::filesystem::current_path().string() + ": begin it with /");
 }
 
 std::string ToYamlText(const XmlRpcValue& constant) {

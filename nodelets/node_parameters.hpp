@@ -87,6 +87,9 @@ PoseGraphNodeParameters ReadPoseGraphParameters(const ros::NodeHandle& private_n
 void Validate(const FrontEndNodeParameters& node, const std::string& path = "");
 void Validate(const BackEndNodeParameters& node, const std::string& path = "");
 
+/// Throws std::invalid_argument unless a path is whole: roslaunch starts nodes in a folder that nobody means.
+void RequireWholePath(const std::string& path);
+
 /// A parameter tree as YAML text (flow style). Throws std::invalid_argument for types that YAML has no word for.
 std::string ToYamlText(const XmlRpc::XmlRpcValue& value);
 

@@ -90,7 +90,7 @@ void PoseGraphNodelet::Subscribe(const std::string& robot) {
 bool PoseGraphNodelet::OnWrite(std_srvs::Trigger::Request& /*request*/, std_srvs::Trigger::Response& response) {
   try {
     worker_->Run([this] {
-      if (parameters_.output_dir.empty()) throw std::runtime_error("the parameter output_dir is not set");
+      if (parameters_.output_dir.empty()) throw std::runtime_error("the parameter output_dir is not set: there is no folder to write to");
       if (has_new_closures_) Optimize();
       WriteTrajectories();
     });

@@ -75,11 +75,14 @@ LocateResult SensorLocator::Locate(const ros::Time& stamp, const std::string& se
 SensorLocator::TransformResult SensorLocator::LookUp(const std::string& target, const std::string& source,
                                                      const ros::Time& stamp) const {
   if (target == source) return {Pose::Identity(), ""};
+  const std::string failed = "no tf from " + target + " to " + source + " at " + Text(stamp) + ": ";
+  for (const std::string& frame : {target, source})
+    if (!tf_buffer_._frameExists(frame))
+      return {std::nullopt, failed + "there is no frame " + frame + WhoNames(frame) + "; " + KnownFrames()};
   try {
     return {ToPose(tf_buffer_.lookupTransform(target, source, stamp).transform, "tf"), ""};
   } catch (const tf2::TransformException& error) {
-    return {std::nullopt, "no tf from " + target + " to " + source + " at " + Text(stamp) + ": " + error.what() + "; " +
-                              KnownFrames()};
+    return {std::nullopt, failed + error.what() + "; " + KnownFrames()};
   }
 }
 
@@ -109,10 +112,20 @@ SensorLocator::TransformResult SensorLocator::LookUpPose(const std::string& sens
   return {*odom_frame_T.T_target_source * *T_frame_child * *child_sensor.T_target_source, ""};
 }
 
+/// Which parameter, if any, a frame's name comes from, as words: there it can be mended.
+std::string SensorLocator::WhoNames(const std::string& frame) const {
+  if (frame == FrameName(parameters_.odom_frame)) return " (parameter odom_frame)";
+  if (frame == FrameName(parameters_.base_frame)) return " (parameter base_frame)";
+  if (frame == FrameName(parameters_.sensor_frame)) return " (parameter sensor_frame)";
+  return "";
+}
+
 std::string SensorLocator::KnownFrames() const {
   std::vector<std::string> frames;
   tf_buffer_._getFrameStrings(frames);
-  if (frames.empty()) return "tf is empty: does anybody publish it?";
+  if (frames.empty())
+    return std::string("tf is empty: does anybody publish it?") +
+           (parameters_.pose_source == PoseSource::kTf ? " Without tf set pose_source to odometry or pose" : "");
   std::string list;
   for (const std::string& frame : frames) list += (list.empty() ? "" : ", ") + frame;
   return "the tree has: " + list;

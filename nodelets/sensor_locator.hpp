@@ -60,6 +60,7 @@ class SensorLocator {
   TransformResult LookUp(const std::string& target, const std::string& source, const ros::Time& stamp) const;
   TransformResult LookUpPose(const std::string& sensor_frame, const ros::Time& stamp) const;
   void Add(const StampedPose& pose, const std::string& frame, const std::string& child_frame);
+  std::string WhoNames(const std::string& frame) const;
   std::string KnownFrames() const;
 
   const FrontEndNodeParameters parameters_;

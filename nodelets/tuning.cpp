@@ -86,12 +86,14 @@ BackEndConfig ToConfig(const BackEndNodelets& parameters) {
 FrontEndNodelets WithConfig(FrontEndNodelets parameters, FrontEndConfig config) {
   ToParameters(&config, &parameters);
   Validate(parameters.node);
+  Validate(parameters.core);
   return parameters;
 }
 
 BackEndNodelets WithConfig(BackEndNodelets parameters, BackEndConfig config) {
   ToParameters(&config, &parameters);
   Validate(parameters.node);
+  Validate(parameters.core);
   return parameters;
 }
 

@@ -21,8 +21,8 @@ namespace incremental_segmatch {
 FrontEndConfig ToConfig(const NodeletParameters<FrontEndNodeParameters>& parameters);
 BackEndConfig ToConfig(const NodeletParameters<BackEndNodeParameters>& parameters);
 
-/// The parameters with those of the configuration in their place. Throw std::invalid_argument naming a nodelet's own
-/// parameter that is out of range; the core judges its own.
+/// The parameters with those of the configuration in their place. Throw std::invalid_argument naming the parameter that is
+/// out of range.
 NodeletParameters<FrontEndNodeParameters> WithConfig(NodeletParameters<FrontEndNodeParameters> parameters,
                                                      FrontEndConfig config);
 NodeletParameters<BackEndNodeParameters> WithConfig(NodeletParameters<BackEndNodeParameters> parameters,

@@ -4,16 +4,22 @@
 #include <geometry_msgs/PoseStamped.h>
 #include <gtest/gtest.h>
 #include <incremental_segmatch/RequestFullState.h>
+#include <incremental_segmatch/LoadMap.h>
+#include <incremental_segmatch/SaveMap.h>
 #include <nav_msgs/Odometry.h>
+#include <nav_msgs/Path.h>
 #include <nodelet/NodeletList.h>
 #include <nodelet/NodeletLoad.h>
 #include <ros/ros.h>
 #include <rosgraph_msgs/Log.h>
 #include <tf2_ros/static_transform_broadcaster.h>
 #include <tf2_ros/transform_broadcaster.h>
+#include <unistd.h>
 
 #include <algorithm>
 #include <cmath>
+#include <cstdio>
+#include <fstream>
 #include <limits>
 #include <map>
 #include <string>
@@ -54,7 +60,8 @@ class BadInput : public testing::Test {
     load.request.type = "incremental_segmatch/" + type;
     for (const std::string topic :
          {"points", "odometry", "pose", "segments", "local_cloud", "local_labels", "front_end_steps", "loop_closures",
-          "reset", "trigger", "trajectory", "save_map", "load_map", "back_end_steps"}) {
+          "reset", "trigger", "trajectory", "save_map", "load_map", "back_end_steps",
+          "corrected_odometry"}) {
       load.request.remap_source_args.push_back("/" + topic);
       load.request.remap_target_args.push_back("/" + prefix + "/" + topic);
     }
@@ -282,7 +289,7 @@ TEST_F(BadInput, PosesOfATopicAreThoseOfTheBase) {
   pose.pose = ToPoseMsg(T_odom_base);
   publisher.publish(pose);
   clouds_.publish(drive_->Cloud(1, "lidar_h"));
-  EXPECT_TRUE(Hears("no tf from base to lidar_h"));
+  EXPECT_TRUE(Hears("there is no frame base (parameter base_frame); "));
 
   Pose T_base_lidar = Pose::Identity();
   T_base_lidar.translation() << 1.0, 0.0, 2.0;
@@ -304,6 +311,72 @@ TEST_F(BadInput, WhatIsMissingIsSaidWithoutBeingAsked) {
   EXPECT_FALSE(IsSaid("/waiting/local_cloud", rosgraph_msgs::Log::WARN)) << "its own output was offered as input";
   clouds_ = nh_.advertise<sensor_msgs::PointCloud2>("/waiting/points", 10);
   EXPECT_TRUE(HearsWithin("nobody publishes /waiting/odometry", 15.0));
+}
+
+TEST_F(BadInput, JumpsNeedATrajectoryInTheFrameThatJumps) {
+  ros::param::set("/jumping/frame_jumps", true);
+  ASSERT_TRUE(LoadAndConnect("jumping"));
+  ASSERT_TRUE(Works(0, "lidar_j"));
+  EXPECT_TRUE(HearsWithin("no jump of odom will be followed (frame_jumps): nobody publishes /jumping/corrected_odometry, "
+                          "and nobody publishes /jumping/trajectory", 15.0));
+  ros::Publisher paths = nh_.advertise<nav_msgs::Path>("/jumping/trajectory", 1);
+  ASSERT_TRUE(WaitFor([&] { return paths.getNumSubscribers() > 0; }));
+  // As our pose graph's, which corrects the map and lets odom alone: a jump it is not.
+  nav_msgs::Path path;
+  path.header.frame_id = "map";
+  path.poses.emplace_back();
+  path.poses.back().header.stamp = ToTime(drive_->stamp_ns(0));
+  path.poses.back().pose = ToPoseMsg(Pose(Eigen::Translation3d(5.0, 0.0, 0.0)) * drive_->T_odom_sensor(0));
+  paths.publish(path);
+  WaitFor([] { return false; }, 0.2);
+  ASSERT_TRUE(Works(1, "lidar_j"));
+  EXPECT_TRUE(Hears("the trajectory is in frame map, but the frame that jumps is odom (odom_frame): it is not followed"));
+  const auto position = [this]() -> Eigen::Vector3d { return ContinuousSensorPose(received_.back()).translation(); };
+  EXPECT_LT((position() - drive_->T_odom_sensor(1).translation()).norm(), 1e-6);
+
+  // A corrected odometry in the frame that jumps, at a scan's stamp: the next scan comes in the frame after the jump.
+  const Pose T_new_old(Eigen::Translation3d(5.0, -3.0, 0.0));
+  ros::Publisher corrections = nh_.advertise<nav_msgs::Odometry>("/jumping/corrected_odometry", 1);
+  ASSERT_TRUE(WaitFor([&] { return corrections.getNumSubscribers() > 0; }));
+  nav_msgs::Odometry corrected;
+  corrected.header.frame_id = "odom";
+  corrected.header.stamp = ToTime(drive_->stamp_ns(1));
+  corrected.pose.pose = ToPoseMsg(T_new_old * drive_->T_odom_sensor(1));
+  corrections.publish(corrected);
+  WaitFor([] { return false; }, 0.2);
+  tf_.sendTransform(ToTransform(T_new_old * drive_->T_odom_sensor(2), "odom", "lidar_j", ToTime(drive_->stamp_ns(2))));
+  const std::size_t before = received_.size();
+  clouds_.publish(drive_->Cloud(2, "lidar_j"));
+  ASSERT_TRUE(WaitFor([&] { return received_.size() > before; }, 5.0));
+  EXPECT_LT((position() - drive_->T_odom_sensor(2).translation()).norm(), 1e-6);
+  EXPECT_LT((ToVector(received_.back().sensor_pose.position) - (T_new_old * drive_->T_odom_sensor(2)).translation()).norm(),
+            1e-6);
+}
+
+TEST_F(BadInput, ATopicOfAnotherTypeIsSaidToBeOne) {
+  ros::Publisher other = nh_.advertise<nav_msgs::Odometry>("/mistaken/points", 1);
+  ASSERT_TRUE(LoadNodelet("mistaken", "FrontEndNodelet", "mistaken"));
+  EXPECT_TRUE(HearsWithin("/mistaken/points has nav_msgs/Odometry, not PointCloud2; ", 15.0));
+}
+
+TEST_F(BadInput, ABackEndWithABrokenMapSaysSoWhateverItIsAskedFor) {
+  const std::string path = "/tmp/incremental_segmatch_broken_" + std::to_string(getpid()) + ".map";
+  std::ofstream(path) << "no map";
+  ros::param::set("/broken/map_file", path);
+  ASSERT_TRUE(LoadNodelet("broken", "BackEndNodelet", "broken"));
+  EXPECT_TRUE(Hears("the back end does not start: " + path + " is not a segment map", rosgraph_msgs::Log::FATAL));
+  SaveMap save;
+  save.request.path = "/tmp/town.map";
+  ASSERT_TRUE(ros::service::waitForService("/broken/save_map", 5000));
+  ASSERT_TRUE(ros::service::call("/broken/save_map", save));
+  EXPECT_FALSE(save.response.success);
+  EXPECT_EQ(save.response.message, "the back end has not started: " + path + " is not a segment map");
+  LoadMap load;
+  load.request.path = "town.map";
+  ASSERT_TRUE(ros::service::call("/broken/load_map", load));
+  EXPECT_NE(load.response.message.find("town.map is no whole path, and this node runs in /"), std::string::npos)
+      << load.response.message;
+  std::remove(path.c_str());
 }
 
 TEST_F(BadInput, ParametersChangeWhileRunningAndARefusalIsExplained) {
@@ -335,7 +408,8 @@ TEST_F(BadInput, ParametersChangeWhileRunningAndARefusalIsExplained) {
 
   config = set("/tuned_map", "epsilon_m", 0.0);
   EXPECT_EQ(value(config, "epsilon_m"), 0.5);
-  EXPECT_NE(refused(config).find("epsilon_m"), std::string::npos) << refused(config);
+  EXPECT_NE(refused(config).find("back_end.recognizer.consistency.epsilon_m: must be > 0, is 0"), std::string::npos)
+      << refused(config);
   EXPECT_TRUE(Hears("a change of the parameters is refused: "));
   config = set("/tuned_map", "closure_min_distance_m", -0.5);
   EXPECT_NE(refused(config).find("closure_min_distance_m: must not be negative"), std::string::npos) << refused(config);
@@ -408,6 +482,7 @@ TEST_F(BadInput, WrongParametersAreFatalByNameAndTheManagerLives) {
   ros::param::set("/wrong_5/front_end/local_radius_m", -3.0);
   ros::param::set("/wrong_6/display_hight_m", 1.0);
   ros::param::set("/wrong_7/pose_graph/sigma", 1.0);
+  ros::param::set("/wrong_8/output_dir", "results");
   const std::vector<WrongParameter> wrong{
       {"wrong_1", "FrontEndNodelet", "unknown parameter /wrong_1/colour"},
       {"wrong_2", "FrontEndNodelet", "grid.resolution"},
@@ -415,7 +490,8 @@ TEST_F(BadInput, WrongParametersAreFatalByNameAndTheManagerLives) {
       {"wrong_4", "FrontEndNodelet", "/no/such/file.yaml"},
       {"wrong_5", "FrontEndNodelet", "local_radius_m"},
       {"wrong_6", "BackEndNodelet", "unknown parameter /wrong_6/display_hight_m"},
-      {"wrong_7", "PoseGraphNodelet", "unknown parameter /wrong_7/pose_graph/sigma"}};
+      {"wrong_7", "PoseGraphNodelet", "unknown parameter /wrong_7/pose_graph/sigma"},
+      {"wrong_8", "PoseGraphNodelet", "parameter /wrong_8/output_dir: results is no whole path"}};
   for (const WrongParameter& w : wrong) {
     ASSERT_TRUE(LoadNodelet(w.nodelet, w.type, w.nodelet)) << w.nodelet;
     EXPECT_TRUE(Hears(w.words, rosgraph_msgs::Log::FATAL));
