@@ -46,6 +46,9 @@ void Pair(BackEndConfig& config, BackEndNodelets& parameters, const Visit& visit
   visit(config.min_coverage, core.acceptance.min_coverage);
   visit(config.min_ratio, core.acceptance.min_ratio);
   visit(config.twin_memory_m, core.acceptance.twin_memory_m);
+  visit(config.min_track_m, core.acceptance.min_track_m);
+  visit(config.min_track_fit, core.acceptance.min_track_fit);
+  visit(config.min_distinction, core.acceptance.min_distinction);
   visit(config.max_contradiction, core.acceptance.max_contradiction);
   visit(config.max_contradiction_once, core.acceptance.max_contradiction_once);
   visit(config.max_distance_m, core.acceptance.max_distance_m);

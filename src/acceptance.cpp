@@ -22,8 +22,17 @@ bool HasRival(const Evidence& evidence, const AcceptanceParameters& parameters) 
   return static_cast<double>(evidence.inliers) < parameters.min_ratio * static_cast<double>(evidence.runner_up);
 }
 
+bool IsDeceptive(const Evidence& evidence, const AcceptanceParameters& parameters) {
+  return HasRival(evidence, parameters) || evidence.since_twin_m < parameters.twin_memory_m;
+}
+
 Verdict Judge(const Evidence& evidence, const AcceptanceParameters& parameters) {
-  if (HasRival(evidence, parameters) || evidence.since_twin_m < parameters.twin_memory_m) return Verdict::kAmbiguous;
+  if (IsDeceptive(evidence, parameters)) {
+    const bool outdoes_rival =
+        !HasRival(evidence, parameters) || evidence.distinction >= parameters.min_distinction;
+    if (!outdoes_rival || evidence.track_m < parameters.min_track_m || evidence.track_fit < parameters.min_track_fit)
+      return Verdict::kAmbiguous;
+  }
   if (evidence.Coverage() < parameters.min_coverage) return Verdict::kUncovered;
   if (evidence.contradiction > parameters.max_contradiction ||
       evidence.contradiction_once > parameters.max_contradiction_once) {
@@ -38,9 +47,14 @@ double Strength(const Evidence& evidence, const AcceptanceParameters& parameters
   constexpr double kUnbound = std::numeric_limits<double>::infinity();
   const auto at_least = [](double value, double least) { return least > 0.0 ? value / least : kUnbound; };
   const auto at_most = [](double value, double most) { return value > 0.0 ? most / value : kUnbound; };
+  const double unrivalled =
+      at_least(static_cast<double>(evidence.inliers), parameters.min_ratio * static_cast<double>(evidence.runner_up));
+  const double plain = std::min(unrivalled, at_least(evidence.since_twin_m, parameters.twin_memory_m));
+  const double borne_out = std::min({std::max(unrivalled, at_least(evidence.distinction, parameters.min_distinction)),
+                                     at_least(evidence.track_m, parameters.min_track_m),
+                                     at_most(1.0 - evidence.track_fit, 1.0 - parameters.min_track_fit)});
   return std::min(
-      {at_least(static_cast<double>(evidence.inliers), parameters.min_ratio * static_cast<double>(evidence.runner_up)),
-       at_least(evidence.since_twin_m, parameters.twin_memory_m), at_least(evidence.Coverage(), parameters.min_coverage),
+      {std::max(plain, borne_out), at_least(evidence.Coverage(), parameters.min_coverage),
        at_most(evidence.contradiction, parameters.max_contradiction),
        at_most(evidence.contradiction_once, parameters.max_contradiction_once),
        at_most(evidence.sigma_m, parameters.max_sigma_m), at_most(evidence.sigma_rad, parameters.max_sigma_rad),
@@ -60,6 +74,10 @@ void Validate(const AcceptanceParameters& parameters) {
   require(parameters.min_ratio >= 0.0, "min_ratio: must not be negative");
   require(parameters.twin_size >= 1, "twin_size: must be at least 1");
   require(parameters.twin_memory_m >= 0.0, "twin_memory_m: must not be negative");
+  require(parameters.min_track_m >= 0.0, "min_track_m: must not be negative");
+  require(parameters.min_track_fit >= 0.0 && parameters.min_track_fit <= 1.0, "min_track_fit: must be between 0 and 1");
+  require(parameters.min_distinction >= 0.0 && parameters.min_distinction <= 1.0,
+          "min_distinction: must be between 0 and 1");
   require(parameters.max_distance_m > 0.0, "max_distance_m: must be positive");
   require(parameters.max_sigma_m > 0.0, "max_sigma_m: must be positive");
   require(parameters.max_sigma_rad > 0.0, "max_sigma_rad: must be positive");

@@ -63,6 +63,13 @@ void TakeToJumpingFrame(const Pose& T_odom_continuous, BackEndStep* step) {
   }
 }
 
+std::vector<Eigen::Vector3d> ToDoubles(const Points& points) {
+  std::vector<Eigen::Vector3d> doubles;
+  doubles.reserve(points.size());
+  for (const Eigen::Vector3f& p : points) doubles.push_back(p.cast<double>());
+  return doubles;
+}
+
 double LargestSigma(const Eigen::Matrix3d& covariance) {
   return std::sqrt(std::max(0.0, Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d>(covariance, Eigen::EigenvaluesOnly).eigenvalues()[2]));
 }
@@ -179,7 +186,7 @@ BackEndStep BackEnd::AttemptRecognition(RobotIndex robot, StageTimer timer) {
 
   step.counts.end = ToStepEnd(result.outcome);
   if (result.recognition) {
-    std::optional<Closure> judged = Verify(robot, robots_[robot].stamp_ns, result, &step.counts);
+    std::optional<Closure> judged = Verify(robot, result, &step.counts);
     if (judged && HasRival(judged->evidence, parameters_.acceptance) &&
         judged->evidence.runner_up >= parameters_.acceptance.twin_size) {
       robots_[robot].twin_path_m = robots_[robot].path_m;
@@ -440,36 +447,109 @@ const SegmentView& BackEnd::MatchedView(RobotIndex robot, const Correspondence& 
   throw std::logic_error("an inlier is none of the candidates");
 }
 
-/// Refines a recognition on scans, gathers the evidence for it and judges that. `counts` gets the evidence and the end,
-/// which says whether what comes back is accepted.
-std::optional<Closure> BackEnd::Verify(RobotIndex robot, StampNs stamp_ns, const RecognizerResult& result,
-                                       BackEndCounts* counts) {
-  const Recognition& recognition = *result.recognition;
-  const std::optional<KeyframeName> target = NearestKeyframe(robot, recognition);
-  if (!target) {
-    counts->end = StepEnd::kTooYoung;
-    return std::nullopt;
+/// Lays a recognition on scans, and where there is a rival, the rival as well: what fits better is the recognition. Gathers the
+/// evidence for it and judges that. `counts` gets the evidence and the end, which says whether what comes back is accepted.
+std::optional<Closure> BackEnd::Verify(RobotIndex robot, const RecognizerResult& result, BackEndCounts* counts) {
+  std::optional<Hypothesis> best = LayOnScans(robot, *result.recognition, &counts->end);
+  if (result.runner_up && (!best || HasRival(best->closure.evidence, parameters_.acceptance))) {
+    StepEnd end;
+    std::optional<Hypothesis> rival = LayOnScans(robot, *result.runner_up, &end);
+    if (rival && (!best || Distinction(*rival, *best) > 0.5)) std::swap(best, rival);
+    if (best) best->closure.evidence.distinction = rival ? Distinction(*best, *rival) : 1.0;
   }
-  Closure closure = MakeClosure(robot, stamp_ns, recognition, *target);
+  if (!best) return std::nullopt;
+
+  Closure& closure = best->closure;
   Evidence& evidence = closure.evidence;
-  evidence.inliers = recognition.inliers.size();
-  evidence.runner_up = recognition.runner_up_size;
-  evidence.since_twin_m = robots_[robot].path_m - robots_[robot].twin_path_m;
-  if (parameters_.refinement.enabled && closure.T_target_query.translation().norm() <= parameters_.acceptance.max_distance_m) {
-    if (!Refine(robot, *target, &closure)) {
-      counts->end = StepEnd::kNotRefined;
-      return std::nullopt;
-    }
-  }
   MeasureCoverage(robot, closure.T_map_odom, &evidence);
-  MeasureContradiction(robot, *target, closure, &evidence);
+  MeasureContradiction(robot, best->target, closure, &evidence);
   evidence.distance_m = closure.T_target_query.translation().norm();
   evidence.sigma_m = LargestSigma(closure.covariance.topLeftCorner<3, 3>());
   evidence.sigma_rad = LargestSigma(closure.covariance.bottomRightCorner<3, 3>());
+  const bool is_deceptive = IsDeceptive(evidence, parameters_.acceptance);
+  if (is_deceptive && !best->fits.empty())
+    FollowTrack(robot, *best, evidence.overlap / ExpectedOverlap(best->target), &evidence);
+  const Verdict verdict = Judge(evidence, parameters_.acceptance);
+  // What is accepted without twins can be relied on.
+  if (!is_deceptive && verdict == Verdict::kAccepted) FollowTrack(robot, *best, 1.0, &evidence);
   counts->evidence = evidence;
-  counts->end = ToStepEnd(Judge(evidence, parameters_.acceptance));
+  counts->end = ToStepEnd(verdict);
   closure.candidates = result.candidates;
-  return closure;
+  return std::move(closure);
+}
+
+/// A recognition as a closure to the key frame there, refined on scans. Nothing, and why, if that can't be.
+std::optional<BackEnd::Hypothesis> BackEnd::LayOnScans(RobotIndex robot, const Recognition& recognition, StepEnd* end) {
+  const std::optional<KeyframeName> target = NearestKeyframe(robot, recognition);
+  if (!target) {
+    *end = StepEnd::kTooYoung;
+    return std::nullopt;
+  }
+  Hypothesis hypothesis{*target, MakeClosure(robot, robots_[robot].stamp_ns, recognition, *target), {}};
+  Evidence& evidence = hypothesis.closure.evidence;
+  evidence.inliers = recognition.inliers.size();
+  evidence.runner_up = recognition.runner_up_size;
+  evidence.since_twin_m = robots_[robot].path_m - robots_[robot].twin_path_m;
+  const bool is_near = hypothesis.closure.T_target_query.translation().norm() <= parameters_.acceptance.max_distance_m;
+  if (parameters_.refinement.enabled && is_near && !Refine(robot, &hypothesis)) {
+    *end = StepEnd::kNotRefined;
+    return std::nullopt;
+  }
+  return hypothesis;
+}
+
+/// Of the scan's points that lie on something at only one of two places the share that does so at the first. One half where
+/// nothing tells the places apart, or one of them was not laid on scans.
+double BackEnd::Distinction(const Hypothesis& first, const Hypothesis& second) {
+  std::size_t only_first = 0, only_second = 0;
+  for (std::size_t i = 0; i < std::min(first.fits.size(), second.fits.size()); ++i) {
+    only_first += first.fits[i] && !second.fits[i];
+    only_second += second.fits[i] && !first.fits[i];
+  }
+  const std::size_t all = only_first + only_second;
+  return all == 0 ? 0.5 : static_cast<double>(only_first) / static_cast<double>(all);
+}
+
+/// Recognitions that agree by odometry make a track. Adds a hypothesis to the one that it continues, and says how long that is,
+/// and how well the scans have fitted along it.
+void BackEnd::FollowTrack(RobotIndex index, const Hypothesis& hypothesis, double fit, Evidence* evidence) {
+  Robot& robot = robots_[index];
+  const auto position = [&](const KeyframeName& target, const Pose& T_target_sensor) {
+    return Eigen::Vector3d((PoseOf(target).T_map_sensor * T_target_sensor).translation());
+  };
+  const auto is_over = [&](const Track& track) {
+    return robot.path_m - track.fits.back().path_m > parameters_.history.spacing_m;
+  };
+  robot.tracks.erase(std::remove_if(robot.tracks.begin(), robot.tracks.end(), is_over), robot.tracks.end());
+  const Eigen::Vector3d place = position(hypothesis.target, hypothesis.closure.T_target_query);
+  const auto continues = [&](const Track& track) {
+    const Pose T_target_now = track.T_target_query * track.T_odom_sensor.inverse() * robot.T_odom_sensor;
+    return (position(track.target, T_target_now) - place).norm() <= parameters_.recognizer.same_place_m;
+  };
+  auto track = std::find_if(robot.tracks.begin(), robot.tracks.end(), continues);
+  if (track == robot.tracks.end()) track = robot.tracks.insert(track, Track{});
+  track->target = hypothesis.target;
+  track->T_target_query = hypothesis.closure.T_target_query;
+  track->T_odom_sensor = robot.T_odom_sensor;
+  track->fits.push_back({robot.path_m, std::min(1.0, fit)});
+  // As long as need be, and no longer.
+  while (track->fits.size() > 1 && robot.path_m - track->fits[1].path_m >= parameters_.acceptance.min_track_m)
+    track->fits.pop_front();
+  evidence->track_m = robot.path_m - track->fits.front().path_m;
+  for (const Fit& link : track->fits) evidence->track_fit += link.value / static_cast<double>(track->fits.size());
+}
+
+/// How much of a key frame's scan lies on those of its neighbours along the trajectory: what can be expected of a scan that is
+/// laid on them.
+double BackEnd::ExpectedOverlap(const KeyframeName& keyframe) {
+  Submap& submap = SubmapAround(keyframe);
+  if (submap.expected_overlap == 0.0) {
+    const std::shared_ptr<const Points>& scan = map_.Keyframes(submap.center.robot)[submap.center.index].scan_sensor;
+    const RefinementTarget others(JoinScans(submap.center, false), parameters_.refinement);
+    if (scan) submap.expected_overlap = others.Overlap(ToDoubles(*scan), Pose::Identity());
+    if (!(submap.expected_overlap > 0.0)) submap.expected_overlap = 1.0;  // a scan that is alone
+  }
+  return submap.expected_overlap;
 }
 
 /// Holds all local segments, not the inliers alone, against the map around the recognised place.
@@ -595,17 +675,15 @@ bool BackEnd::IsYoung(RobotIndex robot, std::uint32_t pose) const {
 
 /// The scan that made the recognition is laid on those around the key frame: neither has drifted, as the local map and the
 /// segments that were gathered along the way have. False if it doesn't fit.
-bool BackEnd::Refine(RobotIndex index, const KeyframeName& target, Closure* closure) {
+bool BackEnd::Refine(RobotIndex index, Hypothesis* hypothesis) {
   const Robot& robot = robots_[index];
+  const KeyframeName& target = hypothesis->target;
+  Closure* const closure = &hypothesis->closure;
   if (!robot.scan_sensor) return false;
-  std::vector<Eigen::Vector3d> points_query;
-  points_query.reserve(robot.scan_sensor->size());
-  for (const Eigen::Vector3f& p : *robot.scan_sensor) points_query.push_back(p.cast<double>());
-
   Submap& submap = SubmapAround(target);
   const Pose T_center_target = PoseOf(submap.center).T_odom_sensor.inverse() * PoseOf(target).T_odom_sensor;
   const std::optional<RefinedTransform> refined =
-      submap.target.Refine(points_query, T_center_target * closure->T_target_query);
+      submap.target.Refine(ToDoubles(*robot.scan_sensor), T_center_target * closure->T_target_query);
   if (!refined) return false;
   const Pose T_target_query = T_center_target.inverse() * refined->T_target_local;
   closure->T_map_odom = closure->T_map_odom * robot.T_odom_sensor * closure->T_target_query.inverse() * T_target_query *
@@ -613,12 +691,13 @@ bool BackEnd::Refine(RobotIndex index, const KeyframeName& target, Closure* clos
   closure->T_target_query = T_target_query;
   closure->covariance = MoveToTheRight(refined->covariance, refined->T_target_local);
   closure->evidence.overlap = refined->overlap;
+  hypothesis->fits = refined->has_partner;
   return true;
 }
 
 /// Of the last submaps one whose center is near, or a new one around the key frame.
 BackEnd::Submap& BackEnd::SubmapAround(const KeyframeName& keyframe) {
-  constexpr std::size_t kKept = 2;  // passes of one street take turns
+  constexpr std::size_t kKept = 4;  // passes of one street take turns, and rivals
   const auto is_near = [&](const Submap& submap) {
     return submap.center.robot == keyframe.robot &&
            std::abs(PoseOf(submap.center).path_m - PoseOf(keyframe).path_m) <= 0.5 * parameters_.keyframes.submap_radius_m;
@@ -627,21 +706,21 @@ BackEnd::Submap& BackEnd::SubmapAround(const KeyframeName& keyframe) {
   if (found != submaps_.end()) {
     std::rotate(submaps_.begin(), found, found + 1);
   } else {
-    submaps_.push_front({keyframe, RefinementTarget(JoinScans(keyframe), parameters_.refinement)});
+    submaps_.push_front({keyframe, RefinementTarget(JoinScans(keyframe, true), parameters_.refinement)});
     if (submaps_.size() > kKept) submaps_.pop_back();
   }
   return submaps_.front();
 }
 
-/// Scans of a key frame and of its neighbours along the trajectory, in its sensor's frame. Odometry joins them.
-std::vector<Eigen::Vector3d> BackEnd::JoinScans(const KeyframeName& center) const {
+/// Scans of a key frame, or not, and of its neighbours along the trajectory, in its sensor's frame. Odometry joins them.
+std::vector<Eigen::Vector3d> BackEnd::JoinScans(const KeyframeName& center, bool with_center) const {
   const std::vector<Keyframe>& keyframes = map_.Keyframes(center.robot);
   const Pose T_center_odom = PoseOf(center).T_odom_sensor.inverse();
   std::vector<Eigen::Vector3d> points;
   const auto add = [&](std::size_t index) {
     const Pose T_center_sensor = T_center_odom * PoseOf({center.robot, index}).T_odom_sensor;
     if (T_center_sensor.translation().norm() > parameters_.keyframes.submap_radius_m) return false;
-    if (keyframes[index].scan_sensor)
+    if (keyframes[index].scan_sensor && (with_center || index != center.index))
       for (const Eigen::Vector3f& p : *keyframes[index].scan_sensor) points.push_back(T_center_sensor * p.cast<double>());
     return true;
   };

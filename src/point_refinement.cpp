@@ -273,6 +273,17 @@ std::vector<std::uint32_t> FindPartners(const std::vector<Eigen::Vector3f>& loca
   return partners;
 }
 
+/// Whether each local point's partner is within the distance.
+std::vector<bool> HavePartners(const std::vector<Eigen::Vector3f>& local, const std::vector<std::uint32_t>& partners,
+                               const Pose& T_target_local, const CellHash& target, double distance_m) {
+  const Eigen::Matrix3f R = T_target_local.linear().cast<float>();
+  const Eigen::Vector3f t = T_target_local.translation().cast<float>();
+  std::vector<bool> have(local.size());
+  for (std::size_t i = 0; i < local.size(); ++i)
+    have[i] = partners[i] != kNone && (R * local[i] + t - target.points()[partners[i]]).norm() <= distance_m;
+  return have;
+}
+
 System BuildSystem(const std::vector<Eigen::Vector3f>& local, const std::vector<std::uint32_t>& partners,
                    const Pose& T_target_local, SurfaceCloud* target, const CellHash& cloud, float radius, float distance,
                    double width_m) {
@@ -483,6 +494,7 @@ std::optional<RefinedTransform> RefinementTarget::Refine(const std::vector<Eigen
   if (!converged) system = impl_->BuildSystem(local, T, last_width_m, &partners);
 
   RefinedTransform refined;
+  refined.has_partner = HavePartners(local, partners.points, T, partners.target->cells(), parameters.min_distance_m);
   refined.overlap = static_cast<double>(system.pairs) / static_cast<double>(local.size());
   if (system.pairs < kMinPairs || refined.overlap < parameters.min_overlap) return std::nullopt;
   const Directions directions(system, parameters.min_stiffness);
@@ -505,6 +517,17 @@ std::optional<RefinedTransform> RefinementTarget::Refine(const std::vector<Eigen
   // Products of many rotations drift from being one.
   refined.T_target_local.linear() = Eigen::Quaterniond(refined.T_target_local.linear()).normalized().toRotationMatrix();
   return refined;
+}
+
+double RefinementTarget::Overlap(const std::vector<Eigen::Vector3d>& points_local, const Pose& T_target_local) const {
+  const std::vector<Eigen::Vector3f> local =
+      Thin(Center(points_local, Eigen::Vector3d::Zero()), impl_->parameters.max_points);
+  if (local.empty()) return 0.0;
+  const std::vector<std::uint32_t> partners =
+      FindPartners(local, Eigen::Translation3d(-impl_->center) * T_target_local, impl_->fine.cells(),
+                   static_cast<float>(impl_->parameters.min_distance_m));
+  const auto alone = std::count(partners.begin(), partners.end(), kNone);
+  return 1.0 - static_cast<double>(alone) / static_cast<double>(partners.size());
 }
 
 }  // namespace incremental_segmatch

@@ -153,12 +153,12 @@ Vertices Fitting(const Correspondences& correspondences, const Pose& T_target_lo
   return fitting;
 }
 
-/// Size of the largest clique among the rest, if it is at least half as large as the winner.
-std::size_t RunnerUpSize(const ConsistencyGraph& graph, std::size_t winner_size, const Vertices& fitting,
-                         MaxCliqueParameters parameters) {
+/// The largest clique among the rest, if it is at least half as large as the winner.
+Vertices FindRunnerUp(const ConsistencyGraph& graph, std::size_t winner_size, const Vertices& fitting,
+                      MaxCliqueParameters parameters) {
   parameters.min_size = std::max<std::size_t>(3, (winner_size + 1) / 2);
   parameters.max_ties = 1;
-  return FindMaxClique(Without(graph, fitting), parameters).vertices.size();
+  return FindMaxClique(Without(graph, fitting), parameters).vertices;
 }
 
 void Validate(const RecognizerParameters& parameters) {
@@ -228,41 +228,50 @@ RecognizerResult Recognizer::Recognize(const Correspondences& correspondences) {
   if (clique.vertices.empty()) return result;
 
   const double transform_start_ms = ThreadCpuMs();
-  const PointPairs pairs = PointPairsOf(sorted, clique.vertices);
   Recognition recognition;
-  recognition.T_target_local = FitTransform(pairs);
-  recognition.rms_m = RootMeanSquareResidual(pairs, recognition.T_target_local);
-  recognition.tilt_rad = TiltOf(recognition.T_target_local);
+  result.outcome = FitAndTest(sorted, clique.vertices, &recognition);
   recognition.proven_maximum = clique.proven_maximum;
   recognition.max_inliers = clique.upper_bound;
   result.transform_ms = ThreadCpuMs() - transform_start_ms;
-  result.outcome = RecognitionOutcome::kDegenerate;
-  if (std::min(SecondSpread(pairs.local), SecondSpread(pairs.target)) < parameters_.min_spread_m) return result;
-  result.outcome = RecognitionOutcome::kTilted;
-  if (recognition.tilt_rad > parameters_.max_tilt_rad) return result;
-  result.outcome = RecognitionOutcome::kLargeResidual;
-  if (recognition.rms_m > parameters_.max_rms_m) return result;
-
-  std::vector<Eigen::Vector3d> moved;
-  for (const std::uint32_t v : clique.vertices) {
-    recognition.inliers.push_back(sorted[v]);
-    moved.push_back(recognition.T_target_local * sorted[v].centroid_local);
-  }
-  recognition.covariance =
-      TransformCovariance(moved, CentroidSigma(recognition.rms_m, moved.size(), parameters_.min_sigma_m));
-  result.transform_ms = ThreadCpuMs() - transform_start_ms;
+  if (result.outcome != RecognitionOutcome::kAccepted) return result;
 
   if (parameters_.find_runner_up) {
     const double runner_up_start_ms = ThreadCpuMs();
     Vertices fitting = Fitting(sorted, recognition.T_target_local, parameters_.same_place_m);
     fitting.insert(fitting.end(), clique.vertices.begin(), clique.vertices.end());
-    recognition.runner_up_size =
-        RunnerUpSize(graph, clique.vertices.size(), fitting, parameters_.clique);
+    const Vertices runner_up = FindRunnerUp(graph, clique.vertices.size(), fitting, parameters_.clique);
+    recognition.runner_up_size = runner_up.size();
+    Recognition other;
+    if (!runner_up.empty() && FitAndTest(sorted, runner_up, &other) == RecognitionOutcome::kAccepted) {
+      other.runner_up_size = clique.vertices.size();
+      result.runner_up = std::move(other);
+    }
     result.clique_ms += ThreadCpuMs() - runner_up_start_ms;
   }
-  result.outcome = RecognitionOutcome::kAccepted;
   result.recognition = std::move(recognition);
   return result;
+}
+
+/// Fits the transform of a clique, and says whether the fit is good enough for a place.
+RecognitionOutcome Recognizer::FitAndTest(const Correspondences& sorted, const std::vector<std::uint32_t>& clique,
+                                          Recognition* recognition) const {
+  const PointPairs pairs = PointPairsOf(sorted, clique);
+  recognition->T_target_local = FitTransform(pairs);
+  recognition->rms_m = RootMeanSquareResidual(pairs, recognition->T_target_local);
+  recognition->tilt_rad = TiltOf(recognition->T_target_local);
+  if (std::min(SecondSpread(pairs.local), SecondSpread(pairs.target)) < parameters_.min_spread_m)
+    return RecognitionOutcome::kDegenerate;
+  if (recognition->tilt_rad > parameters_.max_tilt_rad) return RecognitionOutcome::kTilted;
+  if (recognition->rms_m > parameters_.max_rms_m) return RecognitionOutcome::kLargeResidual;
+
+  std::vector<Eigen::Vector3d> moved;
+  for (const std::uint32_t v : clique) {
+    recognition->inliers.push_back(sorted[v]);
+    moved.push_back(recognition->T_target_local * sorted[v].centroid_local);
+  }
+  recognition->covariance =
+      TransformCovariance(moved, CentroidSigma(recognition->rms_m, moved.size(), parameters_.min_sigma_m));
+  return RecognitionOutcome::kAccepted;
 }
 
 }  // namespace incremental_segmatch

@@ -19,10 +19,16 @@ struct AcceptanceParameters {
       10.0;                    ///< and is expected to be, where any target segment is this near: the map was seen there
   double min_coverage = 0.25;  ///< least share of the expected local segments that are supported
   double min_ratio = 1.75;     ///< of the inliers to the best clique that speaks for another place
-  /// A rival of at least so many matches that makes a place ambiguous is no chance: there are twins hereabouts, and for
-  /// some way nothing is accepted, though some steps may see no rival.
+  /// A rival of at least so many matches is no chance: there are twins hereabouts, and for some way more is demanded,
+  /// though some steps may see no rival.
   std::size_t twin_size = 12;
   double twin_memory_m = 100.0;  ///< the way
+  /// Where there are twins or a rival: recognitions must agree with each other by odometry for so much path,
+  double min_track_m = 50.0;
+  double min_track_fit = 0.975;  ///< their scans must lie on the map's as well, in the mean, as those on each other,
+  /// and a rival's place must be outdone: of the scan's points that lie on something at only one of the two places so
+  /// large a share must do so at the recognised one.
+  double min_distinction = 0.75;
   double max_distance_m = 20.0;  ///< of the query from the pose its target was seen from: odometry drifts in between
   double max_sigma_m = 0.5;      ///< largest standard deviation of the query's position, along its worst axis
   double max_sigma_rad = 0.02;   ///< the same of its orientation
@@ -35,6 +41,9 @@ struct Evidence {
   std::size_t inliers = 0;    ///< matches that agree
   std::size_t runner_up = 0;  ///< size of the best clique that speaks for another place
   double since_twin_m = std::numeric_limits<double>::infinity();  ///< path since a place had a twin
+  double distinction = 0.0;  ///< of the scan's points that fit only one of this and the rival's place: share that fits this
+  double track_m = 0.0;      ///< path over which recognitions agree by odometry; known where there are twins or a rival
+  double track_fit = 0.0;    ///< mean overlap over that path, over the overlap that the map's scans have with each other
   std::size_t expected = 0;   ///< local segments where the map was seen
   std::size_t supported = 0;  ///< of them, those with a target segment in their place
   double overlap =
@@ -62,6 +71,9 @@ enum class Verdict { kAccepted, kAmbiguous, kUncovered, kContradicted, kUncertai
 
 /// Whether another set of correspondences is too large beside the inliers.
 bool HasRival(const Evidence& evidence, const AcceptanceParameters& parameters);
+
+/// Whether segments alone can't be trusted here: there is a rival, or there was one of some size a little way back.
+bool IsDeceptive(const Evidence& evidence, const AcceptanceParameters& parameters);
 
 /// Judges the evidence. O(1).
 Verdict Judge(const Evidence& evidence, const AcceptanceParameters& parameters);

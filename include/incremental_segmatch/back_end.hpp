@@ -189,6 +189,29 @@ class BackEnd {
     double path_m = 0.0;
     RangeImage image;
   };
+  // A key frame of the map.
+  struct KeyframeName {
+    RobotIndex robot = 0;
+    std::size_t index = 0;
+  };
+  // How well a scan lay on the map's.
+  struct Fit {
+    double path_m = 0.0;
+    double value = 0.0;  // its overlap over what could be expected
+  };
+  // Recognitions that agree with each other by odometry.
+  struct Track {
+    KeyframeName target;  // of the last one
+    Pose T_target_query;
+    Pose T_odom_sensor;
+    std::deque<Fit> fits;  // along the way
+  };
+  // A place where the robot may be.
+  struct Hypothesis {
+    KeyframeName target;
+    Closure closure;
+    std::vector<bool> fits;  // whether each of the scan's points lies on something there; empty without refinement
+  };
   struct Robot {
     std::string name;
     RobotIndex frame = 0;  // robots with the same value share a map frame
@@ -202,19 +225,15 @@ class BackEnd {
     Pose T_odom_continuous = Pose::Identity();  // and the jumps
     std::shared_ptr<const Points> scan_sensor;  // of the last delta
     std::deque<PastScan> history;
+    std::vector<Track> tracks;
     std::map<SegmentId, LocalSegment> local;
-  };
-
-  // A key frame of the map.
-  struct KeyframeName {
-    RobotIndex robot = 0;
-    std::size_t index = 0;
   };
 
   // The joined scans of a key frame and of those around it.
   struct Submap {
     KeyframeName center;
-    RefinementTarget target;  // in the sensor's frame of the center
+    RefinementTarget target;        // in the sensor's frame of the center
+    double expected_overlap = 0.0;  // of the center's scan with the others; 0: not asked for yet
   };
 
   RobotIndex RobotByName(const std::string& name);
@@ -231,7 +250,11 @@ class BackEnd {
   bool NeedsQuery(RobotIndex robot, const LocalSegment& segment) const;
   std::map<RobotIndex, Correspondences> CollectCorrespondences(RobotIndex robot) const;
   RecognizerResult Recognize(RobotIndex robot, const std::map<RobotIndex, Correspondences>& by_frame);
-  std::optional<Closure> Verify(RobotIndex robot, StampNs stamp_ns, const RecognizerResult& result, BackEndCounts* counts);
+  std::optional<Closure> Verify(RobotIndex robot, const RecognizerResult& result, BackEndCounts* counts);
+  std::optional<Hypothesis> LayOnScans(RobotIndex robot, const Recognition& recognition, StepEnd* end);
+  static double Distinction(const Hypothesis& first, const Hypothesis& second);
+  void FollowTrack(RobotIndex robot, const Hypothesis& hypothesis, double fit, Evidence* evidence);
+  double ExpectedOverlap(const KeyframeName& keyframe);
   const SegmentView& MatchedView(RobotIndex robot, const Correspondence& inlier) const;
   const TrajectoryPose& PoseOf(const KeyframeName& keyframe) const;
   std::optional<KeyframeName> NearestKeyframeAlong(const KeyframeName& around, double along_m, const Eigen::Vector3d& place) const;
@@ -239,9 +262,9 @@ class BackEnd {
   void KeepHistory(RobotIndex robot);
   bool IsYoung(RobotIndex robot, std::uint32_t pose) const;
   std::optional<KeyframeName> NearestKeyframe(RobotIndex robot, const Recognition& recognition) const;
-  bool Refine(RobotIndex robot, const KeyframeName& target, Closure* closure);
+  bool Refine(RobotIndex robot, Hypothesis* hypothesis);
   Submap& SubmapAround(const KeyframeName& keyframe);
-  std::vector<Eigen::Vector3d> JoinScans(const KeyframeName& center) const;
+  std::vector<Eigen::Vector3d> JoinScans(const KeyframeName& center, bool with_center) const;
   void MeasureCoverage(RobotIndex robot, const Pose& T_map_odom, Evidence* evidence) const;
   Closure MakeClosure(RobotIndex robot, StampNs stamp_ns, const Recognition& recognition, const KeyframeName& keyframe) const;
   void KeepKeyframe(RobotIndex robot, const std::optional<Closure>& closure);

@@ -32,6 +32,7 @@ struct RefinementParameters {
 struct RefinedTransform {
   Pose T_target_local = Pose::Identity();  ///< p_map = T * p_odom
   double overlap = 0.0;                    ///< share of the local points with a partner
+  std::vector<bool> has_partner;           ///< of each local point that was used: the same ones for every target
   double rms_m = 0.0;                      ///< point-to-plane residual
   int open_directions = 0;  ///< directions of six in which the points say nothing and the given pose stays
   /// From the information of the point pairs (points of one cell of min_distance_m count as one), ROS's order,
@@ -56,6 +57,9 @@ class RefinementTarget {
   /// Nothing if the clouds overlap too little or leave more directions of the pose open than allowed.
   /// O(points + max_points * iterations).
   std::optional<RefinedTransform> Refine(const std::vector<Eigen::Vector3d>& points_local, const Pose& T_target_local);
+
+  /// Share of the local points that Refine would use which have a partner under a given transform. O(points).
+  double Overlap(const std::vector<Eigen::Vector3d>& points_local, const Pose& T_target_local) const;
 
  private:
   struct Impl;

@@ -45,6 +45,7 @@ struct Recognition {
 /// A recognition, or the stage that ended it, with counts and times.
 struct RecognizerResult {
   std::optional<Recognition> recognition;                              ///< where the outcome is kAccepted
+  std::optional<Recognition> runner_up;  ///< the other place that its runner-up speaks for, if that passes the same tests
   RecognitionOutcome outcome = RecognitionOutcome::kTooFewCandidates;  ///< how it ended
   std::size_t candidates = 0;                                          ///< correspondences given
   std::size_t edges = 0;                                               ///< consistent pairs
@@ -78,6 +79,9 @@ class Recognizer {
   RecognizerResult Recognize(const Correspondences& correspondences);
 
  private:
+  RecognitionOutcome FitAndTest(const Correspondences& sorted, const std::vector<std::uint32_t>& clique,
+                                Recognition* recognition) const;
+
   RecognizerParameters parameters_;
   ConsistencyGraphBuilder graph_builder_;
 };

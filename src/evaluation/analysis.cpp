@@ -179,6 +179,9 @@ std::vector<FunnelColumn> FunnelColumns() {
 
 std::vector<EvidenceColumn> EvidenceColumns() {
   return {{"runner_up", [](const Evidence& e) { return e.runner_up; }},
+          {"distinction", [](const Evidence& e) { return e.distinction; }},
+          {"track_m", [](const Evidence& e) { return e.track_m; }},
+          {"track_fit", [](const Evidence& e) { return e.track_fit; }},
           {"expected", [](const Evidence& e) { return e.expected; }},
           {"supported", [](const Evidence& e) { return e.supported; }},
           {"contradiction", [](const Evidence& e) { return e.contradiction; }},
