@@ -18,17 +18,13 @@ struct AcceptanceParameters {
   double neighbourhood_m =
       10.0;                    ///< and is expected to be, where any target segment is this near: the map was seen there
   double min_coverage = 0.25;  ///< least share of the expected local segments that are supported
-  double min_ratio = 1.75;     ///< of the inliers to the best clique that speaks for another place
-  /// A rival of at least so many matches is no chance: there are twins hereabouts, and for some way more is demanded,
-  /// though some steps may see no rival.
-  std::size_t twin_size = 12;
-  double twin_memory_m = 100.0;  ///< the way
-  /// Where there are twins or a rival: recognitions must agree with each other by odometry for so much path,
-  double min_track_m = 50.0;
-  double min_track_fit = 0.975;  ///< their scans must lie on the map's as well, in the mean, as those on each other,
-  /// and a rival's place must be outdone: of the scan's points that lie on something at only one of the two places so
-  /// large a share must do so at the recognised one.
-  double min_distinction = 0.75;
+  double min_ratio = 1.75;     ///< of the inliers to the best clique that speaks for another place; less: that is a rival
+  std::size_t twin_size = 12;  ///< a rival of at least so many matches is no chance: there are twins hereabouts
+  /// For so much of path after twins, though some steps may see no rival, and where there is one, more is demanded:
+  double twin_memory_m = 100.0;
+  double min_track_m = 50.0;      ///< path over which recognitions agree with each other by odometry,
+  double min_track_fit = 0.975;   ///< scans that overlap the map's along it, in the mean, as well as those each other,
+  double min_distinction = 0.75;  ///< and a rival that explains so much less of what only one of the places explains
   double max_distance_m = 20.0;  ///< of the query from the pose its target was seen from: odometry drifts in between
   double max_sigma_m = 0.5;      ///< largest standard deviation of the query's position, along its worst axis
   double max_sigma_rad = 0.02;   ///< the same of its orientation

@@ -44,6 +44,26 @@ TEST(Acceptance, EachPartOfTheEvidenceCanRefuse) {
   EXPECT_EQ(judge([](Evidence& e) { e.distance_m = 21.0; }), Verdict::kTooFar);
 }
 
+TEST(Acceptance, WhereSegmentsDeceiveTheWayAndTheScansDecide) {
+  const AcceptanceParameters parameters;
+  const auto judge = [&](auto change) {
+    Evidence evidence = Good();
+    evidence.runner_up = 19;
+    evidence.distinction = 0.8;
+    evidence.track_m = 51.0;
+    evidence.track_fit = 0.99;
+    change(evidence);
+    return Judge(evidence, parameters);
+  };
+  EXPECT_EQ(judge([](Evidence&) {}), Verdict::kAccepted);
+  EXPECT_EQ(judge([](Evidence& e) { e.distinction = 0.7; }), Verdict::kAmbiguous);
+  EXPECT_EQ(judge([](Evidence& e) { e.track_m = 49.0; }), Verdict::kAmbiguous);
+  EXPECT_EQ(judge([](Evidence& e) { e.track_fit = 0.97; }), Verdict::kAmbiguous);
+  EXPECT_EQ(judge([](Evidence& e) { e.runner_up = 0, e.distinction = 0.0, e.since_twin_m = 50.0; }), Verdict::kAccepted)
+      << "no rival now";
+  EXPECT_EQ(judge([](Evidence& e) { e.contradiction = 0.07; }), Verdict::kContradicted);
+}
+
 TEST(Acceptance, StrengthIsTheSmallestFactorByWhichALimitIsKept) {
   const AcceptanceParameters parameters;
   Evidence evidence = Good();
@@ -53,6 +73,9 @@ TEST(Acceptance, StrengthIsTheSmallestFactorByWhichALimitIsKept) {
   EXPECT_DOUBLE_EQ(Strength(evidence, parameters), 20.0 / 14.0);
   evidence.since_twin_m = 25.0;
   EXPECT_DOUBLE_EQ(Strength(evidence, parameters), 0.25);
+  evidence.track_m = 60.0;
+  evidence.track_fit = 0.98;
+  EXPECT_DOUBLE_EQ(Strength(evidence, parameters), 60.0 / 50.0) << "borne out by the way";
   AcceptanceParameters lax;
   lax.min_coverage = lax.twin_memory_m = 0.0;
   EXPECT_EQ(Strength(Evidence(), lax), std::numeric_limits<double>::infinity());
@@ -79,6 +102,9 @@ TEST(Acceptance, StrengthOfOneDividesWhatIsAcceptedFromWhatIsRefused) {
       evidence.expected = random() % 40;
       evidence.supported = chance(0.9) ? evidence.expected : random() % (evidence.expected + 1);
       if (chance(0.1)) evidence.since_twin_m = 2.0 * parameters.twin_memory_m * uniform(random);
+      evidence.track_m = 2.0 * parameters.min_track_m * uniform(random);
+      evidence.track_fit = chance(0.2) ? parameters.min_track_fit : 0.9 + 0.1 * uniform(random);
+      evidence.distinction = chance(0.2) ? parameters.min_distinction : uniform(random);
       evidence.contradiction = around(parameters.max_contradiction);
       evidence.contradiction_once = around(parameters.max_contradiction_once);
       evidence.sigma_m = around(parameters.max_sigma_m);
