@@ -45,7 +45,7 @@ set_target_properties(incremental_segmatch_pose_graph PROPERTIES INSTALL_RPATH $
 set_target_properties(segmatch PROPERTIES INSTALL_RPATH $ORIGIN/${SEGMATCH_LIBRARIES_FROM_PROGRAM})
 install(TARGETS segmatch RUNTIME DESTINATION ${SEGMATCH_PROGRAM_DESTINATION} COMPONENT program)
 if(SEGMATCH_ROS)
-  install(PROGRAMS launch/play_bag.sh DESTINATION ${SEGMATCH_PROGRAM_DESTINATION} COMPONENT program)
+  install(PROGRAMS launch/play_bag.sh launch/rviz.sh DESTINATION ${SEGMATCH_PROGRAM_DESTINATION} COMPONENT program)
 endif()
 
 # Build tree.
