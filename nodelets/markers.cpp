@@ -10,7 +10,8 @@
 namespace incremental_segmatch {
 namespace {
 
-constexpr double kLabelHeight_m = 1.0;  // over the centroid
+constexpr double kLabelHeight_m = 1.0;   // over the centroid
+constexpr double kHistoryLetter_m = 1.0;  // height of a line of the history
 
 std_msgs::ColorRGBA ToColour(std::uint32_t rgb, float alpha = 1.f) {
   std_msgs::ColorRGBA colour;
@@ -174,10 +175,15 @@ visualization_msgs::MarkerArray HistoryMarkers(const TargetMap& map, const Segme
     text += line;
     array.markers.push_back(std::move(points));
   }
+  // Text is centred about its place: so high that its last line, too, is over the segment.
+  const double text_height_m = static_cast<double>(segment->views.size() + 1) * 1.5 * kHistoryLetter_m;
+  const Eigen::Vector3d foot = top + 1.5 * kHistoryLetter_m * Eigen::Vector3d::UnitZ();
+  lines.points.push_back(ToPoint(top));
+  lines.points.push_back(ToPoint(foot));
   array.markers.push_back(std::move(lines));
   visualization_msgs::Marker label = MakeMarker(visualization_msgs::Marker::TEXT_VIEW_FACING, "words", 0, header);
-  label.pose.position = ToPoint(top + 2.0 * Eigen::Vector3d::UnitZ());
-  label.scale.z = 1.0;
+  label.pose.position = ToPoint(foot + 0.5 * text_height_m * Eigen::Vector3d::UnitZ());
+  label.scale.z = kHistoryLetter_m;
   label.color = ToColour(0xffffff);
   label.text = text;
   array.markers.push_back(std::move(label));
