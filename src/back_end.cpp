@@ -783,6 +783,12 @@ void BackEnd::JoinFrames(RobotIndex robot, RobotIndex target_robot, const Pose& 
   index_.RefreshCentroids(map_);
 }
 
-std::size_t BackEnd::memory_bytes() const { return map_.memory_bytes(); }
+std::size_t BackEnd::memory_bytes() const {
+  std::size_t bytes = map_.memory_bytes();
+  for (const Submap& submap : submaps_) bytes += submap.target.memory_bytes();
+  for (const Robot& robot : robots_)
+    for (const PastScan& scan : robot.history) bytes += scan.image.memory_bytes();
+  return bytes;
+}
 
 }  // namespace incremental_segmatch

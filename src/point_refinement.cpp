@@ -71,6 +71,10 @@ class CellHash {
 
   const std::vector<Eigen::Vector3f>& points() const { return points_; }
   float side() const { return side_; }
+  std::size_t memory_bytes() const {
+    return points_.capacity() * sizeof(Eigen::Vector3f) + table_.capacity() * sizeof(Cell) +
+           used_.capacity() * sizeof(std::uint32_t);
+  }
 
   /// Mean of each cell's points.
   std::vector<Eigen::Vector3f> CellMeans() const {
@@ -222,6 +226,7 @@ class SurfaceCloud {
   SurfaceCloud(const std::vector<Eigen::Vector3f>& points, float side) : cells_(points, side), surfaces_(points.size()) {}
 
   const CellHash& cells() const { return cells_; }
+  std::size_t memory_bytes() const { return cells_.memory_bytes() + surfaces_.capacity() * sizeof(Surface); }
   const Surface& SurfaceAt(std::uint32_t point, const CellHash& cloud, float radius) {
     Surface& surface = surfaces_[point];
     if (surface.thin_directions == Surface::kUnknown) surface = EstimateSurface(cloud, cells_.points()[point], radius);
@@ -465,6 +470,10 @@ RefinementTarget::RefinementTarget(const std::vector<Eigen::Vector3d>& points_ta
 RefinementTarget::~RefinementTarget() = default;
 RefinementTarget::RefinementTarget(RefinementTarget&&) noexcept = default;
 RefinementTarget& RefinementTarget::operator=(RefinementTarget&&) noexcept = default;
+
+std::size_t RefinementTarget::memory_bytes() const {
+  return sizeof(Impl) + impl_->fine.memory_bytes() + impl_->coarse.memory_bytes();
+}
 
 std::optional<RefinedTransform> RefinementTarget::Refine(const std::vector<Eigen::Vector3d>& points_local,
                                                          const Pose& T_target_local) {

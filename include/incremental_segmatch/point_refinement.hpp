@@ -61,6 +61,9 @@ class RefinementTarget {
   /// Share of the local points that Refine would use which have a partner under a given transform. O(points).
   double Overlap(const std::vector<Eigen::Vector3d>& points_local, const Pose& T_target_local) const;
 
+  /// Memory held. O(1).
+  std::size_t memory_bytes() const;
+
  private:
   struct Impl;
   std::unique_ptr<Impl> impl_;

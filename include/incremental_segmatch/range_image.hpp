@@ -56,6 +56,9 @@ class RangeImage {
   FreeSpaceCounts Compare(const Points& points, const Pose& T_image_points, double slack_m,
                           const FreeSpaceParameters& parameters) const;
 
+  /// Memory held. O(1).
+  std::size_t memory_bytes() const { return sizeof(*this) + cells_.capacity() * sizeof(Cell); }
+
  private:
   struct Cell {
     float nearest = 0.f;

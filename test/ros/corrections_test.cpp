@@ -58,6 +58,7 @@ class Corrections : public testing::Test {
       if (frame == Frame::kJumping) scan.T_odom_sensor = T_map_odom * scan.T_odom_sensor;
       steps.push_back(back_end.Process(front_end.Process(scan).delta));
     }
+    EXPECT_GT(back_end.memory_bytes(), back_end.map().memory_bytes() + 100000) << "past scans and prepared ones are left out";
     return steps;
   }
 
