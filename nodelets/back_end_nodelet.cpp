@@ -18,6 +18,7 @@ namespace {
 
 constexpr double kWarnPeriod_s = 5.0;
 constexpr double kRequestPeriod_s = 1.0;
+constexpr double kRecognizedPeriod_s = 10.0;  // between lines about recognitions in the log
 constexpr double kMemoryPeriod_s = 2.0;
 constexpr double kCorrection_m = 0.02;    // of a corrected pose, from which on the map follows
 constexpr double kCorrection_rad = 0.001;  // likewise
@@ -416,6 +417,12 @@ void BackEndNodelet::Publish(const BackEndStep& step, const std::string& session
     robot.T_map_continuous = closure.T_map_odom * robot.T_odom_continuous;
     closures_.push_back({closure.robot_query, closure.stamp_query_ns, closure.robot_target, closure.stamp_target_ns});
     if (closure_log_) closure_log_->Add(closure);
+    if (throttle_.IsDue("recognized", kRecognizedPeriod_s))
+      NODELET_INFO("%s at %.1f s is where %s was at %.1f s: %zu of %zu matches agree (recognition %zu)",
+                   closure.robot_query.c_str(), 1e-9 * static_cast<double>(closure.stamp_query_ns),
+                   closure.robot_target.c_str(), 1e-9 * static_cast<double>(closure.stamp_target_ns),
+                   static_cast<std::size_t>(closure.inliers), static_cast<std::size_t>(closure.candidates),
+                   closures_.size());
     if (IsLocalization()) {
       PublishLocalization(closure, robot);
     } else if (IsDue(closure, robot)) {

@@ -37,7 +37,7 @@ void PrintScore(const Score& score, const RunErrors& errors) {
   }
   std::printf("trajectory error    %.2f m before, %.2f m after (RMSE after alignment, %zu poses)\n", errors.odometry_m,
               errors.optimized_m, errors.poses);
-  std::printf("to compare with     %.2f m, which the same pose graph reaches with the true relative poses\n",
+  std::printf("at best             %.2f m, which the same pose graph reaches with the true relative poses at the same places\n",
               errors.bound_same_places_m);
 }
 
