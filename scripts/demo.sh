@@ -77,7 +77,8 @@ else
   mkdir -p "$out" "$ROS_LOG_DIR"
   rm -f "$out"/{played,closures.csv,trajectory_odometry.tum,trajectory_optimized.tum,pose_graph.g2o}
   seconds=$(awk -v rate="$rate" 'END {printf "%.0f", $1 / rate}' "$drive/sequences/00/times.txt")
-  echo "Playing the drive, which takes $seconds s (ROS_MASTER_URI=$ROS_MASTER_URI) ..."
+  echo "Playing the drive, which takes $seconds s (ROS_MASTER_URI=$ROS_MASTER_URI). At the bag's end roslaunch calls the player a"
+  echo "required process that has died, and ends with it: so it is meant."
   roslaunch -p "$port" incremental_segmatch demo.launch bag:="$bag" out:="$out" rate:="$rate" rviz:="$rviz"
   touch "$out/played"
 fi
