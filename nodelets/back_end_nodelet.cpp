@@ -377,6 +377,8 @@ std::vector<std::string> BackEndNodelet::SessionsOf(const std::string& robot_nam
 
 void BackEndNodelet::CorrectTrajectory(const std::string& robot_name, const nav_msgs::Path& path) {
   if (!back_end_ || IsLocalization()) return;
+  if (!path.poses.empty() && path.poses.back().header.stamp.isZero() && throttle_.IsDue("unstamped", kWarnPeriod_s))
+    NODELET_WARN("poses of the trajectory have no stamps: each needs that of its scan, or the map is not corrected");
   for (const std::string& session : SessionsOf(robot_name)) {
     const std::vector<TrajectoryPose>& known = back_end_->map().Trajectory(*FindRobot(back_end_->map(), session));
     std::vector<StampedPose> corrected =

@@ -359,6 +359,19 @@ TEST_F(BadInput, ATopicOfAnotherTypeIsSaidToBeOne) {
   EXPECT_TRUE(HearsWithin("/mistaken/points has nav_msgs/Odometry, not PointCloud2; ", 15.0));
 }
 
+TEST_F(BadInput, ATrajectoryWithoutStampsIsRemarked) {
+  ASSERT_TRUE(LoadNodelet("unstamped", "BackEndNodelet", "unstamped"));
+  ros::Publisher paths = nh_.advertise<nav_msgs::Path>("/unstamped/trajectory", 1);
+  ASSERT_TRUE(WaitFor([&] { return paths.getNumSubscribers() > 0; }));
+  nav_msgs::Path path;
+  path.header.stamp = ToTime(drive_->stamp_ns(0));
+  path.header.frame_id = "map";
+  path.poses.emplace_back();
+  path.poses.back().pose.orientation.w = 1.0;
+  paths.publish(path);
+  EXPECT_TRUE(Hears("poses of the trajectory have no stamps: each needs that of its scan"));
+}
+
 TEST_F(BadInput, ABackEndWithABrokenMapSaysSoWhateverItIsAskedFor) {
   const std::string path = "/tmp/incremental_segmatch_broken_" + std::to_string(getpid()) + ".map";
   std::ofstream(path) << "no map";
