@@ -20,9 +20,9 @@ constexpr double kWarnPeriod_s = 5.0;
 constexpr double kRequestPeriod_s = 1.0;
 constexpr double kRecognizedPeriod_s = 10.0;  // between lines about recognitions in the log
 constexpr double kMemoryPeriod_s = 2.0;
-constexpr double kCorrection_m = 0.02;    // of a corrected pose, from which on the map follows
+constexpr double kCorrection_m = 0.02;     // of a corrected pose, from which on the map follows
 constexpr double kCorrection_rad = 0.001;  // likewise
-constexpr double kLabelRadius_m = 40.0;  // around the robot
+constexpr double kLabelRadius_m = 40.0;    // around the robot
 constexpr double kLetter_m = 0.7;
 constexpr double kResidualExaggeration = 10.0;
 
@@ -381,8 +381,7 @@ void BackEndNodelet::CorrectTrajectory(const std::string& robot_name, const nav_
     NODELET_WARN("poses of the trajectory have no stamps: each needs that of its scan, or the map is not corrected");
   for (const std::string& session : SessionsOf(robot_name)) {
     const std::vector<TrajectoryPose>& known = back_end_->map().Trajectory(*FindRobot(back_end_->map(), session));
-    std::vector<StampedPose> corrected =
-        ToTrajectory(path, parameters_.trajectory_kind, robots_.at(session).frames);
+    std::vector<StampedPose> corrected = ToTrajectory(path, parameters_.trajectory_kind, robots_.at(session).frames);
     const auto is_other_sessions = [&known](const StampedPose& pose) {
       return pose.stamp_ns < known.front().stamp_ns || pose.stamp_ns > known.back().stamp_ns;
     };
@@ -391,17 +390,16 @@ void BackEndNodelet::CorrectTrajectory(const std::string& robot_name, const nav_
   }
 }
 
-/// A corrected pose says nothing of those before it: they stay as they were corrected when they came. The map follows once
-/// it would be off by more than centimetres.
+/// A corrected pose says nothing of those before it: they stay as they were corrected when they came. The map follows
+/// once it would be off by more than centimetres.
 void BackEndNodelet::CorrectPose(const std::string& robot_name, const nav_msgs::Odometry& odometry) {
   if (!back_end_ || IsLocalization()) return;
   const std::vector<std::string> sessions = SessionsOf(robot_name);
   if (sessions.empty()) return;
   const std::string& session = sessions.back();
   Robot& robot = robots_.at(session);
-  const StampedPose pose{
-      ToStampNs(odometry.header.stamp),
-      ToSensorPose(odometry.pose.pose, "corrected_odometry", parameters_.trajectory_kind, robot.frames)};
+  const StampedPose pose{ToStampNs(odometry.header.stamp), ToSensorPose(odometry.pose.pose, "corrected_odometry",
+                                                                        parameters_.trajectory_kind, robot.frames)};
   if (!robot.corrected.empty() && pose.stamp_ns <= robot.corrected.back().stamp_ns) return;
   robot.corrected.push_back(pose);
 

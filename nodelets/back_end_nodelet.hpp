@@ -37,8 +37,8 @@ namespace incremental_segmatch {
 /// missing makes it ask the robot's front end for a full state. A wrong parameter is FATAL, and the nodelet then stays
 /// idle.
 ///
-/// Subscribes `segments`, `trajectory` and `corrected_odometry`, or the same below `<robot>/`; `clicked_point`. Publishes
-/// `loop_closures`; `localization` and tf (in localization); for rviz `target_segments`, `target_labels`,
+/// Subscribes `segments`, `trajectory` and `corrected_odometry`, or the same below `<robot>/`; `clicked_point`.
+/// Publishes `loop_closures`; `localization` and tf (in localization); for rviz `target_segments`, `target_labels`,
 /// `refused_matches`, `accepted_matches`, `residuals`, `closure_lines`, `selected_segment`; `back_end_steps`;
 /// diagnostics. Serves `save_map`, `load_map`, `reset`, `trigger`, and dynamic_reconfigure below `~tuning`.
 class BackEndNodelet : public nodelet::Nodelet {
@@ -57,7 +57,7 @@ class BackEndNodelet : public nodelet::Nodelet {
     Pose T_odom_continuous = Pose::Identity();  ///< jumps of odometry
     std::optional<Pose> T_map_continuous;       ///< of the last recognition
     double path_m = 0.0;
-    std::vector<StampedPose> corrected;         ///< that came one by one: T_map_sensor, ascending stamps
+    std::vector<StampedPose> corrected;      ///< that came one by one: T_map_sensor, ascending stamps
     std::optional<double> published_path_m;  ///< at the last published closure
     StampNs published_ns = 0;
   };
@@ -130,8 +130,8 @@ class BackEndNodelet : public nodelet::Nodelet {
   BackEndParameters core_parameters_;  // likewise
   Throttle throttle_;
 
-  // Services wait for the worker, which may be waiting for the front end's. In a thread of their own, so that they take none
-  // of the manager's from the front end: on one core it has one.
+  // Services wait for the worker, which may be waiting for the front end's. In a thread of their own, so that they take
+  // none of the manager's from the front end: on one core it has one.
   ros::CallbackQueue service_queue_;
   ros::AsyncSpinner service_spinner_{1, &service_queue_};
 

@@ -57,7 +57,8 @@ std::string WhyNobodyPublishes(const std::string& topic, const std::string& type
   const std::string message = type.substr(type.find('/') + 1);
   return (type_there.empty() || type_there == type ? "nobody publishes " + topic
                                                    : topic + " has " + type_there + ", not " + message) +
-         "; " + (elsewhere.empty() ? "no " + message + " is published at all" : message + " is published on: " + elsewhere);
+         "; " +
+         (elsewhere.empty() ? "no " + message + " is published at all" : message + " is published on: " + elsewhere);
 }
 
 }  // namespace
@@ -107,8 +108,7 @@ void FrontEndNodelet::Start() {
     pose_subscriber_ = nh.subscribe("pose", 200, &FrontEndNodelet::OnPose, this);
   if (parameters_.frame_jumps) {
     trajectory_subscriber_ = nh.subscribe("trajectory", 1, &FrontEndNodelet::OnTrajectory, this);
-    corrected_odometry_subscriber_ =
-        nh.subscribe("corrected_odometry", 1, &FrontEndNodelet::OnCorrectedOdometry, this);
+    corrected_odometry_subscriber_ = nh.subscribe("corrected_odometry", 1, &FrontEndNodelet::OnCorrectedOdometry, this);
   }
   cloud_subscriber_ = nh.subscribe("points", kCallbackQueue, &FrontEndNodelet::OnCloud, this);
 
@@ -439,8 +439,8 @@ void FrontEndNodelet::Diagnose(diagnostic_updater::DiagnosticStatusWrapper& stat
   else if (skipped != status_.reported_skipped)
     status.summary(DiagnosticStatus::WARN, "scans are skipped: " + status_.last_skip);
   else if (dropped != status_.reported_dropped)
-    status.summaryf(DiagnosticStatus::WARN, "%.1f scans/s, and %zu dropped since the last report: they come faster", rate_hz,
-                    dropped - status_.reported_dropped);
+    status.summaryf(DiagnosticStatus::WARN, "%.1f scans/s, and %zu dropped since the last report: they come faster",
+                    rate_hz, dropped - status_.reported_dropped);
   else if (parameters_.registered && status_.distance_m > kCoarseFloatDistance_m)
     status.summary(DiagnosticStatus::WARN,
                    "so far from the origin, registered float clouds are coarse: publish doubles");

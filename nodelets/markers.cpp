@@ -10,7 +10,7 @@
 namespace incremental_segmatch {
 namespace {
 
-constexpr double kLabelHeight_m = 1.0;   // over the centroid
+constexpr double kLabelHeight_m = 1.0;    // over the centroid
 constexpr double kHistoryLetter_m = 1.0;  // height of a line of the history
 
 std_msgs::ColorRGBA ToColour(std::uint32_t rgb, float alpha = 1.f) {

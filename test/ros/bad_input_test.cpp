@@ -3,8 +3,8 @@
 #include <dynamic_reconfigure/Reconfigure.h>
 #include <geometry_msgs/PoseStamped.h>
 #include <gtest/gtest.h>
-#include <incremental_segmatch/RequestFullState.h>
 #include <incremental_segmatch/LoadMap.h>
+#include <incremental_segmatch/RequestFullState.h>
 #include <incremental_segmatch/SaveMap.h>
 #include <nav_msgs/Odometry.h>
 #include <nav_msgs/Path.h>
@@ -60,8 +60,7 @@ class BadInput : public testing::Test {
     load.request.type = "incremental_segmatch/" + type;
     for (const std::string topic :
          {"points", "odometry", "pose", "segments", "local_cloud", "local_labels", "front_end_steps", "loop_closures",
-          "reset", "trigger", "trajectory", "save_map", "load_map", "back_end_steps",
-          "corrected_odometry"}) {
+          "reset", "trigger", "trajectory", "save_map", "load_map", "back_end_steps", "corrected_odometry"}) {
       load.request.remap_source_args.push_back("/" + topic);
       load.request.remap_target_args.push_back("/" + prefix + "/" + topic);
     }
@@ -317,8 +316,10 @@ TEST_F(BadInput, JumpsNeedATrajectoryInTheFrameThatJumps) {
   ros::param::set("/jumping/frame_jumps", true);
   ASSERT_TRUE(LoadAndConnect("jumping"));
   ASSERT_TRUE(Works(0, "lidar_j"));
-  EXPECT_TRUE(HearsWithin("no jump of odom will be followed (frame_jumps): nobody publishes /jumping/corrected_odometry, "
-                          "and nobody publishes /jumping/trajectory", 15.0));
+  EXPECT_TRUE(
+      HearsWithin("no jump of odom will be followed (frame_jumps): nobody publishes /jumping/corrected_odometry, "
+                  "and nobody publishes /jumping/trajectory",
+                  15.0));
   ros::Publisher paths = nh_.advertise<nav_msgs::Path>("/jumping/trajectory", 1);
   ASSERT_TRUE(WaitFor([&] { return paths.getNumSubscribers() > 0; }));
   // As our pose graph's, which corrects the map and lets odom alone: a jump it is not.
@@ -330,7 +331,8 @@ TEST_F(BadInput, JumpsNeedATrajectoryInTheFrameThatJumps) {
   paths.publish(path);
   WaitFor([] { return false; }, 0.2);
   ASSERT_TRUE(Works(1, "lidar_j"));
-  EXPECT_TRUE(Hears("the trajectory is in frame map, but the frame that jumps is odom (odom_frame): it is not followed"));
+  EXPECT_TRUE(
+      Hears("the trajectory is in frame map, but the frame that jumps is odom (odom_frame): it is not followed"));
   const auto position = [this]() -> Eigen::Vector3d { return ContinuousSensorPose(received_.back()).translation(); };
   EXPECT_LT((position() - drive_->T_odom_sensor(1).translation()).norm(), 1e-6);
 
@@ -349,8 +351,9 @@ TEST_F(BadInput, JumpsNeedATrajectoryInTheFrameThatJumps) {
   clouds_.publish(drive_->Cloud(2, "lidar_j"));
   ASSERT_TRUE(WaitFor([&] { return received_.size() > before; }, 5.0));
   EXPECT_LT((position() - drive_->T_odom_sensor(2).translation()).norm(), 1e-6);
-  EXPECT_LT((ToVector(received_.back().sensor_pose.position) - (T_new_old * drive_->T_odom_sensor(2)).translation()).norm(),
-            1e-6);
+  EXPECT_LT(
+      (ToVector(received_.back().sensor_pose.position) - (T_new_old * drive_->T_odom_sensor(2)).translation()).norm(),
+      1e-6);
 }
 
 TEST_F(BadInput, ATopicOfAnotherTypeIsSaidToBeOne) {
