@@ -185,7 +185,7 @@ class RandomSequence {
 
 TEST(ConsistencyGraph, EveryMethodGivesTheEdgesOfTheDefinition) {
   std::size_t edges_seen = 0;
-  for (unsigned seed = 0; seed < 300; ++seed) {
+  for (unsigned seed = 0; seed < 1000; ++seed) {
     SCOPED_TRACE("seed " + std::to_string(seed));
     RandomSequence sequence(seed);
     std::map<std::string, ConsistencyGraphBuilder> builders;
@@ -213,7 +213,7 @@ TEST(ConsistencyGraph, EveryMethodGivesTheEdgesOfTheDefinition) {
 }
 
 TEST(ConsistencyGraph, PredicateIsTheDefinition) {
-  for (unsigned seed = 1000; seed < 1030; ++seed) {
+  for (unsigned seed = 1000; seed < 2000; ++seed) {
     SCOPED_TRACE("seed " + std::to_string(seed));
     RandomSequence sequence(seed);
     const ConsistencyParameters& p = sequence.parameters();

@@ -58,7 +58,7 @@ Descriptor RandomDescriptor(std::mt19937& random, int dimensions, bool lattice) 
 }
 
 TEST(DescriptorIndexProperty, EqualsBruteForceOverRandomSequences) {
-  for (unsigned seed = 0; seed < 60; ++seed) {
+  for (unsigned seed = 0; seed < 1000; ++seed) {
     SCOPED_TRACE("seed " + std::to_string(seed));
     std::mt19937 random(seed);
     const bool lattice = seed % 2 == 1;
@@ -98,7 +98,7 @@ TEST(DescriptorIndexProperty, EqualsBruteForceOverRandomSequences) {
 }
 
 TEST(DescriptorIndexProperty, TiesAreBrokenByItemWhateverTheHistory) {
-  for (unsigned seed = 0; seed < 20; ++seed) {
+  for (unsigned seed = 0; seed < 1000; ++seed) {
     SCOPED_TRACE("seed " + std::to_string(seed));
     std::mt19937 random(seed);
     std::vector<std::uint64_t> items(500);

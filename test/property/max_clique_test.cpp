@@ -92,7 +92,7 @@ bool IsClique(const ConsistencyGraph& graph, const Vertices& vertices) {
 }
 
 TEST(MaxClique, EqualsExhaustiveSearchAndTakesTheSmallestList) {
-  for (unsigned seed = 0; seed < 400; ++seed) {
+  for (unsigned seed = 0; seed < 1000; ++seed) {
     SCOPED_TRACE("seed " + std::to_string(seed));
     std::mt19937 random(seed);
     const std::size_t n = 1 + random() % 22;
@@ -143,7 +143,7 @@ TEST(MaxClique, ColouringNeverCutsOffTheMaximum) {
 }
 
 TEST(MaxClique, IsIndependentOfTheLabels) {
-  for (unsigned seed = 0; seed < 200; ++seed) {
+  for (unsigned seed = 0; seed < 1000; ++seed) {
     SCOPED_TRACE("seed " + std::to_string(seed));
     std::mt19937 random(seed);
     const std::size_t n = 20 + random() % 60;
@@ -166,7 +166,7 @@ TEST(MaxClique, IsIndependentOfTheLabels) {
 }
 
 TEST(MaxClique, FindsPlantedCliques) {
-  for (unsigned seed = 0; seed < 30; ++seed) {
+  for (unsigned seed = 0; seed < 200; ++seed) {
     SCOPED_TRACE("seed " + std::to_string(seed));
     std::mt19937 random(seed);
     const std::size_t n = 500;
