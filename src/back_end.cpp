@@ -123,6 +123,9 @@ BackEnd::BackEnd(const BackEndParameters& parameters, TargetMap map, RecognizeFu
   Validate(parameters.free_space);
   Validate(parameters.refinement);
   Validate(parameters.acceptance);
+  if (!(parameters.merging.distance_m >= 0.0)) throw std::invalid_argument("back_end.merging.distance_m: must not be negative");
+  if (!(parameters.merging.descriptor_distance >= 0.0))
+    throw std::invalid_argument("back_end.merging.descriptor_distance: must not be negative");
   if (!(parameters.keyframes.spacing_m > 0.0)) throw std::invalid_argument("back_end.keyframes.spacing_m: must be positive");
   if (!(parameters.keyframes.submap_radius_m >= 0.0))
     throw std::invalid_argument("back_end.keyframes.submap_radius_m: must not be negative");
@@ -227,6 +230,73 @@ void BackEnd::CorrectTrajectory(const std::string& robot, const std::vector<Stam
   if (!IsLoopClosure()) throw std::invalid_argument("the map is fixed in localization: its trajectories can't be corrected");
   map_.CorrectTrajectory(RobotByName(robot), T_map_sensor);
   index_.RefreshCentroids(map_);
+  MergeDuplicates();
+}
+
+/// The nearest ones first; a segment that was merged is gone, and what it was merged into has the views of both from then on.
+void BackEnd::MergeDuplicates() {
+  if (index_.segments() == 0) return;  // nothing tells the scale of descriptors yet
+  struct View {
+    double x;
+    SegmentKey key;
+    const SegmentView* view;
+    Eigen::Vector3d centroid_map;
+  };
+  std::vector<View> views;
+  for (const auto& [key, segment] : map_.segments()) {
+    if (segment.tracked) continue;
+    for (const SegmentView& view : segment.views) {
+      const Eigen::Vector3d centroid_map = map_.CentroidMap(view);
+      views.push_back({centroid_map.x(), key, &view, centroid_map});
+    }
+  }
+  std::sort(views.begin(), views.end(), [](const View& a, const View& b) { return std::tie(a.x, a.key) < std::tie(b.x, b.key); });
+  struct Pair {
+    double distance_m;
+    SegmentKey older, newer;
+  };
+  std::vector<Pair> pairs;
+  const MergingParameters& limits = parameters_.merging;
+  for (auto a = views.begin(); a != views.end(); ++a) {
+    for (auto b = a + 1; b != views.end() && b->x - a->x < limits.distance_m; ++b) {
+      const double distance_m = (a->centroid_map - b->centroid_map).norm();
+      if (distance_m >= limits.distance_m || a->key == b->key) continue;
+      if (robots_[a->key.robot].frame != robots_[b->key.robot].frame) continue;
+      if (index_.Distance(a->view->descriptor, b->view->descriptor) > limits.descriptor_distance) continue;
+      pairs.push_back({distance_m, std::min(a->key, b->key), std::max(a->key, b->key)});
+    }
+  }
+  std::sort(pairs.begin(), pairs.end(), [](const Pair& a, const Pair& b) {
+    return std::tie(a.distance_m, a.older, a.newer) < std::tie(b.distance_m, b.older, b.newer);
+  });
+  std::map<SegmentKey, SegmentKey> merged_into;
+  for (const Pair& pair : pairs) {
+    const TargetSegment* const older = map_.Find(pair.older);
+    const TargetSegment* const newer = map_.Find(pair.newer);
+    if (older == nullptr || newer == nullptr || !AreOfDifferentVisits(*older, *newer)) continue;
+    index_.Close(pair.older);
+    index_.Close(pair.newer);
+    map_.MoveViews(pair.newer, pair.older);
+    AwaitRelease(pair.older);
+    merged_into[pair.newer] = pair.older;
+  }
+  for (Robot& robot : robots_) {
+    for (auto& [id, segment] : robot.local) {
+      if (!segment.same_as) continue;
+      for (auto it = merged_into.find(*segment.same_as); it != merged_into.end(); it = merged_into.find(*segment.same_as))
+        segment.same_as = it->second;
+    }
+  }
+}
+
+/// What a robot saw within the time window is a segment each.
+bool BackEnd::AreOfDifferentVisits(const TargetSegment& a, const TargetSegment& b) const {
+  const auto window_ns = static_cast<StampNs>(parameters_.matching.time_window_s * 1e9);
+  for (const SegmentView& view_a : a.views)
+    for (const SegmentView& view_b : b.views)
+      if (view_a.robot == view_b.robot && std::abs(map_.PoseOf(view_a).stamp_ns - map_.PoseOf(view_b).stamp_ns) <= window_ns)
+        return false;
+  return true;
 }
 
 RobotIndex BackEnd::RobotByName(const std::string& name) {
@@ -459,6 +529,7 @@ std::optional<Closure> BackEnd::Verify(RobotIndex robot, const RecognizerResult&
   }
   if (!best) return std::nullopt;
 
+  robots_[robot].target = best->target;
   Closure& closure = best->closure;
   Evidence& evidence = closure.evidence;
   MeasureCoverage(robot, closure.T_map_odom, &evidence);
@@ -573,8 +644,8 @@ const TrajectoryPose& BackEnd::PoseOf(const KeyframeName& keyframe) const {
   return map_.Trajectory(keyframe.robot)[map_.Keyframes(keyframe.robot)[keyframe.index].pose];
 }
 
-/// Of the key frames along the passes on which the matched segments were seen the one nearest to the recognised place: other
-/// passes may lie where they don't belong, until a correction. None if all of them are too young.
+/// Of the key frames along the passes on which the matched segments were seen, kept or recognised there, the one nearest to the
+/// recognised place: other passes may lie where they don't belong, until a correction. None if all of them are too young.
 std::optional<BackEnd::KeyframeName> BackEnd::NearestKeyframe(RobotIndex robot, const Recognition& recognition) const {
   std::map<RobotIndex, std::vector<double>> seen_from_m;  // path of the poses, by robot
   for (const Correspondence& inlier : recognition.inliers) {
@@ -586,17 +657,17 @@ std::optional<BackEnd::KeyframeName> BackEnd::NearestKeyframe(RobotIndex robot, 
   double nearest2 = std::numeric_limits<double>::infinity();
   for (auto& [other, paths_m] : seen_from_m) {
     std::sort(paths_m.begin(), paths_m.end());
-    for (std::size_t i = 0; i < map_.Keyframes(other).size(); ++i) {
-      const KeyframeName keyframe{other, i};
-      const TrajectoryPose& pose = PoseOf(keyframe);
-      const double distance2 = (pose.T_map_sensor.translation() - place).squaredNorm();
-      if (distance2 >= nearest2) continue;
-      const auto next = std::lower_bound(paths_m.begin(), paths_m.end(), pose.path_m - parameters_.keyframes.reach_m);
-      if (next == paths_m.end() || *next > pose.path_m + parameters_.keyframes.reach_m) continue;
-      if (other == robot && IsYoung(robot, map_.Keyframes(other)[i].pose)) continue;
+    const auto consider = [&, &paths_m = paths_m](const KeyframeName& keyframe, double path_m) {
+      const double distance2 = (PoseOf(keyframe).T_map_sensor.translation() - place).squaredNorm();
+      if (distance2 >= nearest2) return;
+      const auto next = std::lower_bound(paths_m.begin(), paths_m.end(), path_m - parameters_.keyframes.reach_m);
+      if (next == paths_m.end() || *next > path_m + parameters_.keyframes.reach_m) return;
+      if (keyframe.robot == robot && IsYoung(robot, map_.Keyframes(robot)[keyframe.index].pose)) return;
       nearest2 = distance2;
       nearest = keyframe;
-    }
+    };
+    for (std::size_t i = 0; i < map_.Keyframes(other).size(); ++i) consider({other, i}, PoseOf({other, i}).path_m);
+    for (const Sighting& sighting : robots_[other].sightings) consider(sighting.keyframe, sighting.path_m);
   }
   return nearest;
 }
@@ -751,13 +822,16 @@ Closure BackEnd::MakeClosure(RobotIndex robot, StampNs stamp_ns, const Recogniti
   return closure;
 }
 
-/// Keeps this step's scan if the robot went far enough since the last key frame, and is not where one is already.
+/// Keeps this step's scan if the robot went far enough since the last key frame, or remembers that there is one already.
 void BackEnd::KeepKeyframe(RobotIndex index, const std::optional<Closure>& closure) {
   Robot& robot = robots_[index];
   const double spacing_m = parameters_.keyframes.spacing_m;
   if (robot.path_m - robot.keyframe_path_m < spacing_m) return;
-  if (closure && closure->T_target_query.translation().norm() < spacing_m) return;
-  map_.AddKeyframe(index, robot.scan_sensor);
+  if (closure && closure->T_target_query.translation().norm() < spacing_m) {
+    robot.sightings.push_back({robot.path_m, robot.target});
+  } else {
+    map_.AddKeyframe(index, robot.scan_sensor);
+  }
   robot.keyframe_path_m = robot.path_m;
 }
 

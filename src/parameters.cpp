@@ -402,6 +402,10 @@ const std::vector<Parameter>& Table() {
       NUMBER(back_end.keyframes.reach_m, Above(0),
              "path between the key frame of a closure and the poses that matched segments were seen from, at most"),
 
+      NUMBER(back_end.merging.distance_m, AtLeast(0),
+             "after a correction, segments of different visits whose centroids are this near become one; 0: none do"),
+      NUMBER(back_end.merging.descriptor_distance, AtLeast(0), "if their scaled descriptors differ by at most so much"),
+
       NUMBER(back_end.history.length_m, AtLeast(0), "so much of path behind the robot speaks for or against a place"),
       NUMBER(back_end.history.spacing_m, Above(0), "path between the scans of it that are kept"),
       NUMBER(back_end.history.max_distance_m, Above(0), "they are held against key frames this near"),

@@ -27,7 +27,12 @@ void TargetIndex::Open(const SegmentKey& segment, const TargetMap& map, std::siz
     const SegmentView& taken = target->views[view];
     Insert({segment, view, taken.robot, taken.descriptor, map.CentroidMap(taken), true, is_released});
   }
-  if (index_ && index_->size() >= rescale_at_) Rescale();
+  if (!index_) return;
+  if (index_->size() >= rescale_at_) {
+    Rescale();
+  } else if (views_.size() >= 2 * std::max(index_->size(), rescale_at_)) {
+    Compact();
+  }
 }
 
 void TargetIndex::Close(const SegmentKey& segment) {
@@ -87,26 +92,32 @@ void TargetIndex::Insert(IndexedView view) {
   views_.push_back(std::move(view));
 }
 
+/// Scales by the data that are there now.
 void TargetIndex::Rescale() {
   rescale_at_ = 2 * index_->size();
-  ++generation_;
-  std::vector<IndexedView> views;
-  for (IndexedView& view : views_)
-    if (view.live) views.push_back(std::move(view));
-
   const Eigen::Index dimensions = weights_.size();
   Eigen::VectorXd sum = Eigen::VectorXd::Zero(dimensions), squares = sum;
-  for (const IndexedView& view : views) {
+  for (const IndexedView& view : views_) {
+    if (!view.live) continue;
     sum += view.descriptor.cast<double>();
     squares += view.descriptor.cast<double>().cwiseAbs2();
   }
-  const double n = static_cast<double>(views.size());
+  const double n = static_cast<double>(index_->size());
   const Eigen::VectorXd variance = squares / n - (sum / n).cwiseAbs2();
   constexpr double kLeastDeviation = 1e-3;  // a dimension that never varies tells nothing, whatever its rounding errors
   for (Eigen::Index i = 0; i < dimensions; ++i)
     weights_[i] = static_cast<float>(variance[i] > kLeastDeviation * kLeastDeviation ? 1.0 / std::sqrt(variance[i]) : 0.0);
 
-  index_.emplace(static_cast<std::size_t>(dimensions));
+  Compact();
+}
+
+/// Forgets items that were closed: in a map that does not grow, segments come and go all the same.
+void TargetIndex::Compact() {
+  ++generation_;
+  std::vector<IndexedView> views;
+  for (IndexedView& view : views_)
+    if (view.live) views.push_back(std::move(view));
+  index_.emplace(static_cast<std::size_t>(weights_.size()));
   views_.clear();
   items_.clear();
   for (IndexedView& view : views) Insert(std::move(view));

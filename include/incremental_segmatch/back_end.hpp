@@ -53,6 +53,12 @@ struct HistoryParameters {
   double drift = 0.01;          ///< metres of odometry's drift per metre of path that are allowed for
 };
 
+/// When segments that were seen on different visits are one object: after a correction they lie on each other and look alike.
+struct MergingParameters {
+  double distance_m = 0.5;           ///< between the centroids of two views; 0: nothing is merged
+  double descriptor_distance = 3.0;  ///< scaled, between these views
+};
+
 /// Of the map side.
 struct BackEndParameters {
   Mode mode = Mode::kLoopClosure;    ///< loop closure or localization
@@ -64,6 +70,7 @@ struct BackEndParameters {
   RefinementParameters refinement;   ///< of the transform, on scans
   AcceptanceParameters acceptance;   ///< evidence that a recognition must have
   TargetMapParameters target_map;    ///< what is kept
+  MergingParameters merging;         ///< and what of it is the same
 };
 
 /// A matched pair of segments, for evidence and display.
@@ -159,7 +166,9 @@ class BackEnd {
   /// that holds for life (mode, target_map): nothing has changed then. All local segments are matched anew.
   void ChangeParameters(const BackEndParameters& parameters);
 
-  /// The corrected trajectory of a robot (sensor poses in the map): its target segments move along. O(map).
+  /// The corrected trajectory of a robot (sensor poses in the map): its target segments move along. Segments that lie on
+  /// each other then, with like descriptors, become one, unless they are tracked or were seen on the same visit (METHOD 4).
+  /// O(map), but for those near each other along one axis.
   void CorrectTrajectory(const std::string& robot, const std::vector<StampedPose>& T_map_sensor);
 
   /// The target map.
@@ -212,6 +221,11 @@ class BackEnd {
     Closure closure;
     std::vector<bool> fits;  // whether each of the scan's points lies on something there; empty without refinement
   };
+  // Where on its way a robot recognised a key frame to be so near that it kept none of its own.
+  struct Sighting {
+    double path_m = 0.0;
+    KeyframeName keyframe;
+  };
   struct Robot {
     std::string name;
     RobotIndex frame = 0;  // robots with the same value share a map frame
@@ -220,7 +234,9 @@ class BackEnd {
     StampNs stamp_ns = 0;
     double path_m = 0.0;
     double twin_path_m = -std::numeric_limits<double>::infinity();      // where a place last had a twin
-    double keyframe_path_m = -std::numeric_limits<double>::infinity();  // where the last key frame was kept
+    double keyframe_path_m = -std::numeric_limits<double>::infinity();  // where the last key frame was kept or sighted
+    KeyframeName target;              // of the last recognition that was judged
+    std::vector<Sighting> sightings;  // of key frames
     Pose T_odom_sensor = Pose::Identity();      // odom without its jumps, here and in all else that is kept
     Pose T_odom_continuous = Pose::Identity();  // and the jumps
     std::shared_ptr<const Points> scan_sensor;  // of the last delta
@@ -244,6 +260,8 @@ class BackEnd {
   void RenameSegment(RobotIndex robot, const RenamedSegment& renamed);
   void UpdateSegment(RobotIndex robot, const SegmentState& state, const SegmentDelta& delta);
   void AwaitRelease(const SegmentKey& key);
+  void MergeDuplicates();
+  bool AreOfDifferentVisits(const TargetSegment& a, const TargetSegment& b) const;
   void ReleaseTargets(StampNs now_ns);
   std::size_t CountReleased(const TargetSegment& target) const;
   bool MatchSegment(RobotIndex robot, LocalSegment* segment) const;

@@ -69,6 +69,7 @@ class TargetIndex {
   void Insert(IndexedView view);
   void Erase(std::uint64_t item);
   void Rescale();
+  void Compact();
 
   Descriptor weights_;  // one over the scale of each dimension
   std::vector<IndexedView> views_;

@@ -244,6 +244,26 @@ TEST(IncrementalSegmenter, LabelsAreReclaimed) {
   EXPECT_LT(segmenter.memory_bytes() + grid.memory_bytes(), 1.2 * bytes_early);
 }
 
+/// Tiny scans at 10 Hz for a day: labels, clusters and IDs come and go, and what is held stays what it was after minutes.
+TEST(IncrementalSegmenter, ADayLongRunHoldsNoMoreThanAShortOne) {
+  constexpr int kStepsADay = 864000;
+  DynamicVoxelGrid grid(DynamicVoxelGridParameters{});
+  SegmenterParameters parameters;
+  parameters.min_cluster_size = 2;
+  IncrementalSegmenter<EuclideanPolicy> segmenter(parameters, grid);
+  std::mt19937 random(4);
+  const auto unit = [&] { return static_cast<float>(random() % 1000) * 1e-3f; };
+  std::size_t bytes_early = 0;
+  for (int step = 0; step < kStepsADay; ++step) {
+    const double x = 0.1 * step;
+    if (step % 4 == 0) segmenter.Remove(grid.RemoveOutside({x, 0, 0}, 2.0).removed);
+    const Points points{{unit(), unit(), 0.f}, {unit(), unit(), 0.f}, {unit(), unit(), 0.f}};
+    segmenter.Insert(grid.Insert(points, Pose(Eigen::Translation3d(x, 0, 0))));
+    if (step == kStepsADay / 100) bytes_early = segmenter.memory_bytes() + grid.memory_bytes();
+  }
+  EXPECT_LT(segmenter.memory_bytes() + grid.memory_bytes(), 1.2 * bytes_early);
+}
+
 TEST(IncrementalSegmenter, MergedSegmentsKeepTheOlderIdInEveryOrder) {
   // Two segments, then a bridge: one renaming, from the newer to the older.
   DynamicVoxelGrid grid(DynamicVoxelGridParameters{});

@@ -1,8 +1,11 @@
-// When segments become targets of their own robot: view by view, as these get old enough.
+// When segments become targets of their own robot: view by view, as these get old enough. What is the same becomes one.
 
 #include "incremental_segmatch/back_end.hpp"
 
 #include <gtest/gtest.h>
+
+#include <cmath>
+#include <random>
 
 namespace incremental_segmatch {
 namespace {
@@ -35,6 +38,18 @@ class Drive {
     delta.changed = std::move(changed);
     delta.retired = std::move(retired);
     return back_end_.Process(delta).counts.allowed_targets;
+  }
+
+  /// Where the robot really was.
+  void Correct(const std::vector<std::pair<double, double>>& times_s_and_x_m) {
+    std::vector<StampedPose> poses;
+    for (const auto& [time_s, x_m] : times_s_and_x_m) {
+      StampedPose pose;
+      pose.stamp_ns = static_cast<StampNs>(time_s * kSecond);
+      pose.T_frame_sensor.translation().x() = x_m;
+      poses.push_back(pose);
+    }
+    back_end_.CorrectTrajectory("robot", poses);
   }
 
   const BackEnd& back_end() const { return back_end_; }
@@ -81,6 +96,152 @@ TEST(BackEnd, WhatAnotherRobotSeesIsATargetAtOnce) {
   drive.AllowedAt(0, 0, {State(1, true)}, {}, "one");
   EXPECT_EQ(drive.AllowedAt(1, 0, {}, {}, "two"), 1u);
   EXPECT_EQ(drive.AllowedAt(2, 1, {State(2, true)}, {}, "one"), 2u) << "tracked ones as well";
+}
+
+SegmentState StateAt(SegmentId id, double x_m, float look) {
+  SegmentState state = State(id, true);
+  state.centroid_odom.x() = x_m;
+  state.descriptor.setConstant(look);
+  return state;
+}
+
+/// Segments 1 and 2 stand at 5 m and 5.3 m and are seen together; an object at 5.1 m is seen as segment 3, 100 s later,
+/// when odometry has drifted by 3 m. Returns how many views segment 1 has after the correction, 0 if it is gone.
+std::size_t ViewsAfterTheSecondVisit(const BackEndParameters& parameters, float look, bool is_tracked,
+                                     std::size_t* segments) {
+  Drive drive(parameters);
+  drive.AllowedAt(0, 0, {StateAt(1, 5.0, 1.f), StateAt(2, 5.3, 1.f)});
+  drive.AllowedAt(10, 100, {}, {{1, RetirementCause::kLeft}, {2, RetirementCause::kLeft}});
+  drive.AllowedAt(100, 3, {StateAt(3, 8.1, look)});
+  if (!is_tracked) drive.AllowedAt(101, 4, {}, {{3, RetirementCause::kLeft}});
+  drive.Correct({{0, 0}, {10, 100}, {100, 0}});
+  *segments = drive.back_end().map().segments().size();
+  const TargetSegment* const first = drive.back_end().map().Find({0, 1});
+  return first == nullptr ? 0 : first->views.size();
+}
+
+TEST(BackEnd, WhatLiesOnEachOtherAfterACorrectionIsOneObject) {
+  std::size_t segments = 0;
+  EXPECT_EQ(ViewsAfterTheSecondVisit({}, 1.2f, false, &segments), 2u);
+  EXPECT_EQ(segments, 2u) << "those that were seen together stay two";
+  EXPECT_EQ(ViewsAfterTheSecondVisit({}, 3.f, false, &segments), 1u) << "it looks otherwise";
+  EXPECT_EQ(segments, 3u);
+  EXPECT_EQ(ViewsAfterTheSecondVisit({}, 1.2f, true, &segments), 1u) << "it is tracked: it may still change";
+  EXPECT_EQ(segments, 3u);
+  BackEndParameters parameters;
+  parameters.merging.distance_m = 0.05;
+  EXPECT_EQ(ViewsAfterTheSecondVisit(parameters, 1.2f, false, &segments), 1u) << "it is elsewhere";
+  parameters.merging.distance_m = 0.0;
+  EXPECT_EQ(ViewsAfterTheSecondVisit(parameters, 1.2f, false, &segments), 1u);
+}
+
+/// Landmarks along a ring road, seen as new segments on every lap, with odometry that drifts and a map that is corrected
+/// at every closure.
+class Laps {
+ public:
+  explicit Laps(unsigned seed) : random_(seed), back_end_(Parameters()) {
+    for (int i = 0; i < 150; ++i) {
+      const double angle = 2.0 * M_PI * Unit(), radius_m = kRadius_m + 30.0 * (Unit() - 0.5);
+      landmarks_.push_back({{radius_m * std::cos(angle), radius_m * std::sin(angle), 3.0 * Unit()}, Look(2.0), 0});
+    }
+  }
+
+  std::size_t landmarks() const { return landmarks_.size(); }
+  const BackEnd& back_end() const { return back_end_; }
+
+  /// Returns the steps with a closure.
+  std::size_t DriveOneLap() {
+    std::size_t closures = 0;
+    for (int k = 0; k < kStepsALap; ++k) closures += Step();
+    return closures;
+  }
+
+ private:
+  struct Landmark {
+    Eigen::Vector3d position;
+    Descriptor look;
+    SegmentId tracked_as;  // 0: out of sight
+  };
+  static constexpr double kRadius_m = 60.0;
+  static constexpr int kStepsALap = 75;
+
+  static BackEndParameters Parameters() {
+    BackEndParameters parameters;
+    parameters.refinement.enabled = false;  // there are no scans
+    parameters.matching.nearest = 3;        // so few that many a landmark is not recognised, but only found to lie there
+    return parameters;
+  }
+  double Unit() { return std::uniform_real_distribution<double>(0.0, 1.0)(random_); }
+  Descriptor Look(double scale) {
+    Descriptor look(6);
+    for (float& value : look) value = static_cast<float>(scale * std::normal_distribution<double>()(random_));
+    return look;
+  }
+
+  bool Step() {
+    const double angle = 2.0 * M_PI * step_ / kStepsALap;
+    Pose T_world_sensor = Pose::Identity();
+    T_world_sensor.linear() = Eigen::AngleAxisd(angle + M_PI / 2.0, Eigen::Vector3d::UnitZ()).toRotationMatrix();
+    T_world_sensor.translation() = kRadius_m * Eigen::Vector3d(std::cos(angle), std::sin(angle), 0.0);
+    const Pose T_odom_world = Eigen::Translation3d(0.02 * step_, 0.0, 0.0) *
+                              Eigen::AngleAxisd(2e-4 * step_, Eigen::Vector3d::UnitZ()) * Pose::Identity();
+    SegmentDelta delta;
+    delta.robot = "robot";
+    delta.sequence = static_cast<std::uint64_t>(step_ + 1);
+    delta.full_state = step_ == 0;
+    delta.stamp_ns = (step_ + 1) * kSecond;
+    delta.T_odom_sensor = T_odom_world * T_world_sensor;
+    for (Landmark& landmark : landmarks_) {
+      const bool is_seen = (landmark.position - T_world_sensor.translation()).norm() < 30.0;
+      if (is_seen && landmark.tracked_as == 0) {
+        landmark.tracked_as = ++last_id_;
+        SegmentState state = State(landmark.tracked_as, true);
+        const Eigen::Vector3d noise_m = 0.05 * Eigen::Vector3d(Unit(), Unit(), Unit());
+        state.centroid_odom = T_odom_world * (landmark.position + noise_m);
+        state.descriptor = landmark.look + Look(0.5);
+        delta.changed.push_back(state);
+      } else if (!is_seen && landmark.tracked_as != 0) {
+        delta.retired.push_back({landmark.tracked_as, RetirementCause::kLeft});
+        landmark.tracked_as = 0;
+      }
+    }
+    ++step_;
+    StampedPose truth;
+    truth.stamp_ns = delta.stamp_ns;
+    truth.T_frame_sensor = T_world_sensor;
+    truth_.push_back(truth);
+    const bool is_closure = back_end_.Process(delta).closure.has_value();
+    if (is_closure) back_end_.CorrectTrajectory("robot", truth_);
+    return is_closure;
+  }
+
+  std::mt19937 random_;
+  BackEnd back_end_;
+  std::vector<Landmark> landmarks_;
+  std::vector<StampedPose> truth_;
+  int step_ = 0;
+  SegmentId last_id_ = 0;
+};
+
+TEST(BackEnd, TheMapStopsGrowingAfterTheFirstLap) {
+  for (unsigned seed = 0; seed < 3; ++seed) {
+    SCOPED_TRACE("seed " + std::to_string(seed));
+    Laps laps(seed);
+    laps.DriveOneLap();
+    const TargetMap& map = laps.back_end().map();
+    const std::size_t keyframes = map.Keyframes(0).size();
+    laps.DriveOneLap();
+    // Those in sight stand in the map twice until their tracking ends.
+    const std::size_t segments = map.segments().size();
+    EXPECT_LT(segments, laps.landmarks() + laps.landmarks() / 3);
+    for (int lap = 3; lap <= 10; ++lap) {
+      SCOPED_TRACE("lap " + std::to_string(lap));
+      EXPECT_GT(laps.DriveOneLap(), 65u) << "of 75 steps";
+      EXPECT_LE(map.segments().size(), segments + 3);
+      EXPECT_LE(map.Keyframes(0).size(), keyframes + 10);
+      EXPECT_LT(laps.back_end().targets().next_item(), 20 * laps.landmarks()) << "closed items are forgotten";
+    }
+  }
 }
 
 }  // namespace
