@@ -6,6 +6,7 @@
 #include <pcl/recognition/cg/geometric_consistency.h>
 
 #include <algorithm>
+#include <chrono>
 #include <memory>
 #include <random>
 #include <tuple>
@@ -176,6 +177,48 @@ void GroupWithPcl(benchmark::State& state) {
   state.counters["inliers"] = static_cast<double>(inliers);
 }
 
+/// Edges at random, and all those among a share of the vertices.
+ConsistencyGraph RandomGraph(std::size_t vertices, double density, double planted, unsigned seed) {
+  std::mt19937 random(seed);
+  std::bernoulli_distribution is_edge(density), is_member(planted);
+  std::vector<bool> members;
+  for (std::size_t v = 0; v < vertices; ++v) members.push_back(is_member(random));
+  std::vector<ConsistencyGraph::Edge> edges;
+  for (std::uint32_t a = 0; a < vertices; ++a) {
+    for (std::uint32_t b = a + 1; b < vertices; ++b) {
+      if ((members[a] && members[b]) || is_edge(random)) edges.emplace_back(a, b);
+    }
+  }
+  return ConsistencyGraph::FromEdges(vertices, edges);
+}
+
+/// The clique alone, to the proof, one of several graphs after the other.
+void FindClique(benchmark::State& state, std::size_t vertices, double density, double planted) {
+  MaxCliqueParameters parameters;
+  parameters.min_size = kMinCliqueSize;
+  parameters.max_work = ~std::uint64_t{0};
+  parameters.deadline = std::chrono::seconds(100);
+  std::vector<ConsistencyGraph> graphs;
+  for (unsigned seed = 0; seed < 10; ++seed) graphs.push_back(RandomGraph(vertices, density, planted, seed));
+  std::size_t next = 0, proven = 0;
+  double inliers = 0.0;
+  for (auto _ : state) {
+    const MaxCliqueResult result = FindMaxClique(graphs[next++ % graphs.size()], parameters);
+    proven += result.proven_maximum;
+    inliers += static_cast<double>(result.vertices.size());
+  }
+  state.counters["proven"] = static_cast<double>(proven) / static_cast<double>(state.iterations());
+  state.counters["inliers"] = inliers / static_cast<double>(state.iterations());
+}
+
+BENCHMARK_CAPTURE(FindClique, inliers_90_percent, 2000, 0.3, 0.9)
+    ->Name("maximum clique/2000 vertices, 90 % planted/ours")
+    ->Iterations(10)
+    ->Unit(benchmark::kMillisecond);
+BENCHMARK_CAPTURE(FindClique, dense_random, 100, 0.9, 0.0)
+    ->Name("maximum clique/G(100, 0.9)/ours")
+    ->Iterations(10)
+    ->Unit(benchmark::kMillisecond);
 BENCHMARK(GroupWithPcl)->Arg(300)->Arg(2000)->Arg(5500)->Arg(10000)->Unit(benchmark::kMillisecond);
 BENCHMARK_CAPTURE(RecognizeOurs, all_pairs, ConsistencyMethod::kAllPairs)
     ->Arg(300)
