@@ -259,9 +259,9 @@ std::vector<bool> InCore(const ConsistencyGraph& graph, std::size_t order) {
   return in_core;
 }
 
-/// Without the edges that are in no clique of `size` vertices because an end is in no core of that order, or for lack of
-/// triangles with others (a truss remains). One pass, O(sum over edges of the neighbours of an end); nothing where that is too
-/// much, or where no edge goes.
+/// Without the edges that are in no clique of `size` vertices because an end is in no core of that order, or for lack
+/// of triangles with others (a truss remains). One pass, O(sum over edges of the neighbours of an end); nothing where
+/// that is too much, or where no edge goes.
 std::optional<ConsistencyGraph> WithoutUnsupportedEdges(const ConsistencyGraph& graph, std::size_t size) {
   constexpr std::uint64_t kMostStepsPerEdge = 64;
   const std::vector<bool> in_core = InCore(graph, size - 1);
@@ -422,8 +422,8 @@ class Finder {
   Effort effort_;             ///< of the search for the maximum
   ConsistencyGraph reduced_;  ///< the given one, without what can't matter any more
   CoreGraph graph_;           ///< of it
-  Vertices best_;      ///< incumbent in the original graph, sorted
-  std::size_t floor_;  ///< only larger cliques are looked for
+  Vertices best_;             ///< incumbent in the original graph, sorted
+  std::size_t floor_;         ///< only larger cliques are looked for
   MaxCliqueResult result_;
   BitGraph bits_;
   Vertices local_index_;  ///< scratch, all 0 between uses: one more than the index in the bit graph

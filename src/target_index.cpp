@@ -51,7 +51,8 @@ void TargetIndex::Erase(std::uint64_t item) {
 void TargetIndex::RefreshCentroids(const TargetMap& map) {
   for (const auto& [segment, items] : items_) {
     const TargetSegment* target = map.Find(segment);
-    for (const std::uint64_t item : items) views_[item].centroid_map = map.CentroidMap(target->views[views_[item].view]);
+    for (const std::uint64_t item : items)
+      views_[item].centroid_map = map.CentroidMap(target->views[views_[item].view]);
   }
 }
 
@@ -59,14 +60,16 @@ std::vector<TargetCandidate> TargetIndex::Nearest(const Descriptor& query, Robot
                                                   float max_distance) const {
   if (!index_) return {};
   const Descriptor scaled = query.cwiseProduct(weights_);
-  // Several of the nearest views may belong to one segment, or be closed to the robot: look on until there are enough segments.
+  // Several of the nearest views may belong to one segment, or be closed to the robot: look on until there are enough
+  // segments.
   for (std::size_t wanted = count == 0 ? index_->size() : 2 * count;; wanted *= 2) {
     const std::vector<DescriptorMatch> matches = index_->Nearest(scaled, wanted, max_distance);
     std::unordered_set<SegmentKey, SegmentKeyHash> seen;
     std::vector<TargetCandidate> candidates;
     for (const DescriptorMatch& match : matches) {
       const SegmentKey& segment = views_[match.item].segment;
-      if (IsOpen(match.item, robot) && seen.insert(segment).second) candidates.push_back({match.item, segment, match.distance});
+      if (IsOpen(match.item, robot) && seen.insert(segment).second)
+        candidates.push_back({match.item, segment, match.distance});
     }
     const bool exhausted = matches.size() < wanted || wanted >= index_->size();
     if (!exhausted && candidates.size() < count) continue;
@@ -84,8 +87,9 @@ void TargetIndex::Insert(IndexedView view) {
     index_.emplace(static_cast<std::size_t>(weights_.size()));
   }
   if (view.descriptor.size() != weights_.size())
-    throw std::invalid_argument("a descriptor of " + std::to_string(view.descriptor.size()) + " values does not fit the map's " +
-                                std::to_string(weights_.size()) + ": use the descriptor settings that the map was made with");
+    throw std::invalid_argument("a descriptor of " + std::to_string(view.descriptor.size()) +
+                                " values does not fit the map's " + std::to_string(weights_.size()) +
+                                ": use the descriptor settings that the map was made with");
   const std::uint64_t item = views_.size();
   items_[view.segment].push_back(item);
   index_->Insert(item, view.descriptor.cwiseProduct(weights_));
@@ -106,7 +110,8 @@ void TargetIndex::Rescale() {
   const Eigen::VectorXd variance = squares / n - (sum / n).cwiseAbs2();
   constexpr double kLeastDeviation = 1e-3;  // a dimension that never varies tells nothing, whatever its rounding errors
   for (Eigen::Index i = 0; i < dimensions; ++i)
-    weights_[i] = static_cast<float>(variance[i] > kLeastDeviation * kLeastDeviation ? 1.0 / std::sqrt(variance[i]) : 0.0);
+    weights_[i] =
+        static_cast<float>(variance[i] > kLeastDeviation * kLeastDeviation ? 1.0 / std::sqrt(variance[i]) : 0.0);
 
   Compact();
 }

@@ -36,8 +36,9 @@ struct TargetCandidate {
 class TargetIndex {
  public:
   /// Opens views of a segment of the map to matching: the oldest `released` ones by all robots, and the others, if
-  /// `others_too`, by other robots than the one that took them. What is open already stays; close a segment before its views change.
-  /// Throws std::invalid_argument if its descriptors differ in size from those that are there. O(views of it).
+  /// `others_too`, by other robots than the one that took them. What is open already stays; close a segment before its
+  /// views change. Throws std::invalid_argument if its descriptors differ in size from those that are there. O(views of
+  /// it).
   void Open(const SegmentKey& segment, const TargetMap& map, std::size_t released, bool others_too);
   /// Closes a segment; nothing happens if it isn't open.
   void Close(const SegmentKey& segment);

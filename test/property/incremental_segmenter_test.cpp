@@ -1,5 +1,5 @@
-// Contracts 3 and 4 of the segmenter: clusters are connected components over all voxels ever clustered, and IDs follow the
-// rules of METHOD 3 whatever happens.
+// Contracts 3 and 4 of the segmenter: clusters are connected components over all voxels ever clustered, and IDs follow
+// the rules of METHOD 3 whatever happens.
 
 #include "incremental_segmatch/incremental_segmenter.hpp"
 
@@ -17,7 +17,8 @@ namespace {
 /// The slow, obvious segmenter: remembers every voxel that was ever clustered and every pair that was joined.
 class Reference {
  public:
-  Reference(const SegmenterParameters& parameters, const DynamicVoxelGrid& grid) : parameters_(parameters), grid_(&grid) {}
+  Reference(const SegmenterParameters& parameters, const DynamicVoxelGrid& grid)
+      : parameters_(parameters), grid_(&grid) {}
 
   void Remove(const std::vector<RemovedVoxel>& removed) {
     for (const RemovedVoxel& voxel : removed) {
@@ -34,7 +35,8 @@ class Reference {
     }
     for (const VoxelHandle voxel : activated)
       for (const auto& [other, index] : by_handle_)
-        if (other != voxel && (grid_->CentroidGrid(other) - grid_->CentroidGrid(voxel)).norm() <= parameters_.growing_radius_m)
+        if (other != voxel &&
+            (grid_->CentroidGrid(other) - grid_->CentroidGrid(voxel)).norm() <= parameters_.growing_radius_m)
           Join(by_handle_.at(voxel), index);
   }
   int Component(VoxelHandle voxel) const { return Find(by_handle_.at(voxel)); }
@@ -112,7 +114,8 @@ void ExpectAgreement(const DynamicVoxelGrid& grid, const IncrementalSegmenter<Eu
     const std::uint32_t cluster = segmenter.ClusterOf(voxel);
     EXPECT_EQ(cluster_of_component.emplace(component, cluster).first->second, cluster);
     EXPECT_EQ(component_of_cluster.emplace(cluster, component).first->second, component);
-    EXPECT_EQ(segment_of_component.emplace(component, segmenter.SegmentOf(voxel)).first->second, segmenter.SegmentOf(voxel));
+    EXPECT_EQ(segment_of_component.emplace(component, segmenter.SegmentOf(voxel)).first->second,
+              segmenter.SegmentOf(voxel));
     members[component].push_back(voxel);
   }
   EXPECT_EQ(segmenter.counts().clusters, cluster_of_component.size());
@@ -122,7 +125,8 @@ void ExpectAgreement(const DynamicVoxelGrid& grid, const IncrementalSegmenter<Eu
   for (const auto& [component, segment] : segment_of_component) {
     const std::size_t size = sizes.at(component);
     if (size < parameters.min_cluster_size || size > parameters.max_cluster_size || reference.IsCut(component)) {
-      const bool grows_only = parameters.boundary == BoundaryPolicy::kKeep;  // else it may have shrunk below the minimum
+      const bool grows_only =
+          parameters.boundary == BoundaryPolicy::kKeep;  // else it may have shrunk below the minimum
       if (grows_only || reference.IsCut(component) || size > parameters.max_cluster_size) {
         EXPECT_EQ(segment, kNoSegment);
       }
@@ -149,7 +153,8 @@ void ExpectAgreement(const DynamicVoxelGrid& grid, const IncrementalSegmenter<Eu
   EXPECT_EQ(segmenter.counts().segments, segments.size());
 }
 
-VoxelHandle AnyVoxel(const Reference& reference, const IncrementalSegmenter<EuclideanPolicy>& segmenter, SegmentId segment) {
+VoxelHandle AnyVoxel(const Reference& reference, const IncrementalSegmenter<EuclideanPolicy>& segmenter,
+                     SegmentId segment) {
   const auto found = std::find_if(reference.by_handle().begin(), reference.by_handle().end(),
                                   [&](const auto& entry) { return segmenter.SegmentOf(entry.first) == segment; });
   return found->first;
@@ -244,7 +249,8 @@ TEST(IncrementalSegmenter, LabelsAreReclaimed) {
   EXPECT_LT(segmenter.memory_bytes() + grid.memory_bytes(), 1.2 * bytes_early);
 }
 
-/// Tiny scans at 10 Hz for a day: labels, clusters and IDs come and go, and what is held stays what it was after minutes.
+/// Tiny scans at 10 Hz for a day: labels, clusters and IDs come and go, and what is held stays what it was after
+/// minutes.
 TEST(IncrementalSegmenter, ADayLongRunHoldsNoMoreThanAShortOne) {
   constexpr int kStepsADay = 864000;
   DynamicVoxelGrid grid(DynamicVoxelGridParameters{});

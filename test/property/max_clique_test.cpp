@@ -198,8 +198,7 @@ TEST(MaxClique, KnownSizesOfDenseGraphs) {
         if (random() % 100 < percent) edges.emplace_back(a, b);
       }
     }
-    const MaxCliqueResult result =
-        FindMaxClique(ConsistencyGraph::FromEdges(n, edges), Parameters(3));
+    const MaxCliqueResult result = FindMaxClique(ConsistencyGraph::FromEdges(n, edges), Parameters(3));
     EXPECT_TRUE(result.proven_maximum);
     EXPECT_EQ(result.vertices.size(), size);
   }

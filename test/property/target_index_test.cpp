@@ -85,7 +85,8 @@ class RandomMap {
   bool Chance(double p) { return Unit() < p; }
   Descriptor RandomDescriptor() {
     Descriptor descriptor(5);
-    for (int i = 0; i < 5; ++i) descriptor[i] = static_cast<float>((i + 1) * std::normal_distribution<double>()(random_));
+    for (int i = 0; i < 5; ++i)
+      descriptor[i] = static_cast<float>((i + 1) * std::normal_distribution<double>()(random_));
     return descriptor;
   }
   SegmentKey RandomKey() {

@@ -135,8 +135,8 @@ TEST(BackEnd, WhatLiesOnEachOtherAfterACorrectionIsOneObject) {
   EXPECT_EQ(ViewsAfterTheSecondVisit(parameters, 1.2f, false, &segments), 1u);
 }
 
-/// Landmarks along a ring road, seen as new segments on every lap, with odometry that drifts and a map that is corrected
-/// at every closure.
+/// Landmarks along a ring road, seen as new segments on every lap, with odometry that drifts and a map that is
+/// corrected at every closure.
 class Laps {
  public:
   explicit Laps(unsigned seed) : random_(seed), back_end_(Parameters()) {
@@ -168,7 +168,7 @@ class Laps {
   static BackEndParameters Parameters() {
     BackEndParameters parameters;
     parameters.refinement.enabled = false;  // there are no scans
-    parameters.matching.nearest = 3;        // so few that many a landmark is not recognised, but only found to lie there
+    parameters.matching.nearest = 3;  // so few that many a landmark is not recognised, but only found to lie there
     return parameters;
   }
   double Unit() { return std::uniform_real_distribution<double>(0.0, 1.0)(random_); }
