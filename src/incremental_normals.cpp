@@ -7,6 +7,7 @@
 #include <Eigen/Geometry>
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <limits>
 #include <stdexcept>
 #include <string>
@@ -15,21 +16,10 @@ namespace incremental_segmatch {
 namespace {
 
 constexpr VoxelHandle kCells = DynamicVoxelGrid::kCellsPerBlock;
-constexpr unsigned kSide = DynamicVoxelGrid::kBlockSide;
+constexpr int kSide = DynamicVoxelGrid::kBlockSide;
+constexpr std::size_t kMostReached = 7 * 7 * 7;  // blocks around a voxel, by a radius of 8 voxels
 
-/// Bit i is set where lane i is at most the limit.
-std::uint64_t LanesAtMost(const Eigen::Array4f& lanes, float limit) {
-#if defined(__SSE2__)
-  return static_cast<std::uint64_t>(_mm_movemask_ps(_mm_cmple_ps(_mm_loadu_ps(lanes.data()), _mm_set1_ps(limit))));
-#else
-  std::uint64_t bits = 0;
-  for (int i = 0; i < 4; ++i) bits |= static_cast<std::uint64_t>(lanes[i] <= limit) << i;
-  return bits;
-#endif
-}
-
-/// The finest power of two of units per cell for which all sums over a full neighbourhood are exact: products in float, sums in
-/// 32 bits. A neighbour lies within the radius of a point that is at most half a cell from the reference, on each axis.
+/// The finest power of two of units per cell for which all sums over a full neighbourhood fit 32 bits. A neighbour lies within the radius of a point that is at most half a cell from the reference, on each axis.
 int UnitsPerCell(const NeighbourStencil& stencil, double radius_cells) {
   std::size_t most_neighbours = 0;
   for (unsigned cell = 0; cell < kCells; ++cell) {
@@ -43,7 +33,7 @@ int UnitsPerCell(const NeighbourStencil& stencil, double radius_cells) {
   }
   int units = 512;
   const auto largest_product = [&] { return std::pow((radius_cells + 0.5) * units, 2); };
-  while (largest_product() > 0x1p24 || largest_product() * static_cast<double>(most_neighbours) >= 0x1p31) units /= 2;
+  while (largest_product() * static_cast<double>(most_neighbours) >= 0x1p31) units /= 2;
   return units;
 }
 
@@ -98,214 +88,190 @@ IncrementalNormals::IncrementalNormals(const NormalsParameters& parameters, cons
     throw std::invalid_argument("normals.renewal_tolerance_voxels: must not be negative, is " +
                                 std::to_string(parameters.renewal_tolerance_voxels));
   units_per_cell_ = UnitsPerCell(stencil_, radius_cells);
-  const auto center_of = [&](unsigned index) { return (static_cast<float>(index) + 0.5f) * static_cast<float>(units_per_cell_); };
-  for (unsigned cell = 0; cell < kCells; ++cell)
-    cell_centers_[cell] = Position(center_of(cell % kSide), center_of(cell / kSide % kSide), center_of(cell / (kSide * kSide)), 0.f);
   unit_m_ = resolution_m / units_per_cell_;
   units_per_m_ = static_cast<float>(1.0 / unit_m_);
   const double radius_units = radius_cells * units_per_cell_ * (1.0 + 1e-9);  // radii that are whole voxels are whole units
-  radius2_units_ = static_cast<float>(std::floor(radius_units * radius_units));
+  radius2_units_ = static_cast<int>(radius_units * radius_units);
   const double tolerance_units = parameters.renewal_tolerance_voxels * units_per_cell_;
   tolerance2_units_ = static_cast<float>(tolerance_units * tolerance_units);
 }
 
-/// Adds (sign 1) or takes out (-1) what a position relative to the accumulators' reference contributes: products of integers, exact
-/// in float.
-template <int kSign>
-void IncrementalNormals::Accumulate(const Position& p, Moments* moments) {
-  moments->squares += kSign * (p.xyz1 * p.xyz1).cast<int>();
-  moments->products += kSign * (p.xyz1 * p.yzx1).cast<int>();
-  moments->sum += kSign * p.xyz1.cast<int>();
-}
-
-/// Takes out what position a contributes and adds what b does, given b - a and a + b: b b - a a = (b - a) (b + a), and
-/// bx by - ax ay = ((bx - ax) (by + ay) + (by - ay) (bx + ax)) / 2. Exact as well.
-void IncrementalNormals::AccumulateMove(const Position& difference, const Position& sum, Moments* moments) {
-  moments->squares += (difference.xyz1 * sum.xyz1).cast<int>();
-  moments->products += (0.5f * (difference.xyz1 * sum.yzx1 + difference.yzx1 * sum.xyz1)).cast<int>();
-  moments->sum += difference.xyz1.cast<int>();
-}
-
 void IncrementalNormals::Remove(const std::vector<RemovedVoxel>& removed) {
-  // All leave before any takes back what it gave: nobody cares for the accumulators of those that go along.
-  leaving_.clear();
   for (const RemovedVoxel& gone : removed) {
     if (!IsAnchored(gone.voxel)) continue;
-    Masks& home = masks_[gone.voxel / kCells];
-    home.anchored &= ~CellBit(gone.voxel);
-    home.overdue &= ~CellBit(gone.voxel);
-    leaving_.push_back(gone.voxel);
+    masks_[gone.voxel / kCells].anchored &= ~CellBit(gone.voxel);
+    MarkStaleAround(gone.voxel);
   }
-  for (const VoxelHandle voxel : leaving_) Replace<true, false>(voxel, Position());
 }
 
 void IncrementalNormals::Insert(const VoxelUpdate& update) {
   const std::size_t blocks = grid_->handle_capacity() / kCells;
   blocks_.Grow(blocks);
   if (masks_.size() < blocks) masks_.resize(blocks);
-  for (const MovedVoxel& moved : update.moved) {
-    Masks& home = masks_[moved.voxel / kCells];
-    if ((home.overdue & CellBit(moved.voxel)) != 0) continue;
-    const Position position = PositionOf(moved.voxel, grid_->CentroidInBlock(moved.voxel));
-    const Position anchor = blocks_[moved.voxel / kCells].Anchor(moved.voxel % kCells);
-    if ((position - anchor).xyz1.matrix().squaredNorm() <= tolerance2_units_) continue;
-    home.overdue |= CellBit(moved.voxel);
-    grid_->ForEachStencilBlock(stencil_, moved.voxel, [&](std::uint32_t slot, const NeighbourStencil::BlockVisit& at) {
-      masks_[slot].stale |= masks_[slot].anchored & at.cells;
-      return true;
-    });
+  constexpr std::size_t kAhead = 16;
+  for (std::size_t i = 0; i < update.moved.size(); ++i) {
+    if (i + kAhead < update.moved.size()) {
+      const VoxelHandle next = update.moved[i + kAhead].voxel;
+      __builtin_prefetch(&blocks_[next / kCells].anchors[next % kCells]);
+      __builtin_prefetch(&grid_->CentroidInBlock(next));
+    }
+    const VoxelHandle voxel = update.moved[i].voxel;
+    const Position position = PositionOf(voxel, grid_->CentroidInBlock(voxel));
+    if (static_cast<float>((position - AnchorInBlock(voxel)).matrix().squaredNorm()) > tolerance2_units_)
+      SetAnchor(voxel, position);
   }
-  for (const VoxelHandle voxel : update.activated)
-    Replace<false, true>(voxel, PositionOf(voxel, grid_->CentroidInBlock(voxel)));
+  for (const VoxelHandle voxel : update.activated) {
+    masks_[voxel / kCells].anchored |= CellBit(voxel);
+    SetAnchor(voxel, PositionOf(voxel, grid_->CentroidInBlock(voxel)));
+  }
 }
 
-/// Renews the contributions that are overdue among all that may reach the voxel's accumulators: if there are any, its estimate is
-/// stale.
-void IncrementalNormals::RenewAround(VoxelHandle voxel) const {
-  if ((masks_[voxel / kCells].stale & CellBit(voxel)) == 0) return;
-  renewing_.clear();
-  grid_->ForEachStencilBlock(stencil_, voxel, [&](std::uint32_t slot, const NeighbourStencil::BlockVisit& at) {
-    for (std::uint64_t cells = masks_[slot].overdue & at.cells; cells != 0; cells &= cells - 1)
-      renewing_.push_back(slot * kCells + static_cast<VoxelHandle>(__builtin_ctzll(cells)));
+void IncrementalNormals::SetAnchor(VoxelHandle voxel, const Position& position) {
+  PackedPosition& anchor = blocks_[voxel / kCells].anchors[voxel % kCells];
+  for (int axis = 0; axis < 3; ++axis) anchor[static_cast<std::size_t>(axis)] = static_cast<std::int16_t>(position[axis]);
+  anchor[3] = 1;
+  MarkStaleAround(voxel);
+}
+
+/// Wherever in its cell the voxel was, is, or will be.
+void IncrementalNormals::MarkStaleAround(VoxelHandle voxel) {
+  grid_->ForEachStencilBlock(stencil_, voxel, [this](std::uint32_t slot, const NeighbourStencil::BlockVisit& at) {
+    masks_[slot].stale |= at.cells;
     return true;
   });
-  for (const VoxelHandle overdue : renewing_) Renew(overdue);
 }
 
-void IncrementalNormals::Renew(VoxelHandle voxel) const {
-  masks_[voxel / kCells].overdue &= ~CellBit(voxel);
-  Replace<true, true>(voxel, PositionOf(voxel, grid_->CentroidInBlock(voxel)));
+IncrementalNormals::Position IncrementalNormals::CellCenter(VoxelHandle voxel) const {
+  const int cell = static_cast<int>(voxel % kCells);
+  const auto center = [this](int index) { return index * units_per_cell_ + units_per_cell_ / 2; };
+  return {center(cell % kSide), center(cell / kSide % kSide), center(cell / (kSide * kSide))};
 }
 
 IncrementalNormals::Position IncrementalNormals::PositionOf(VoxelHandle voxel, const Eigen::Vector3f& in_block) const {
-  const Lanes& center = cell_centers_[voxel % kCells].xyz1;
-  const float half = 0.5f * static_cast<float>(units_per_cell_);
-  const auto round = [&](int axis) {  // must not carry it out of its cell
-    return std::clamp(std::floor(in_block[axis] * units_per_m_ + 0.5f), center[axis] - half, center[axis] + half);
-  };
-  return {round(0), round(1), round(2)};
+  const Position units = (in_block.array() * units_per_m_ + 0.5f).cast<int>();
+  const Position center = CellCenter(voxel);
+  const int half = units_per_cell_ / 2;
+  return units.max(center - half).min(center + half);  // rounding must not carry it out of its cell
+}
+
+IncrementalNormals::Position IncrementalNormals::AnchorInBlock(VoxelHandle voxel) const {
+  const PackedPosition& anchor = blocks_[voxel / kCells].anchors[voxel % kCells];
+  return {anchor[0], anchor[1], anchor[2]};
 }
 
 /// Which of the cells have their anchors within the radius of a position, both relative to the block's corner.
 std::uint64_t IncrementalNormals::CellsWithinRadius(const Block& block, std::uint64_t cells, const Position& position) const {
-  const Lanes x = Lanes::Constant(position.xyz1[0]), y = Lanes::Constant(position.xyz1[1]), z = Lanes::Constant(position.xyz1[2]);
+  const PackedPosition from{static_cast<std::int16_t>(position.x()), static_cast<std::int16_t>(position.y()),
+                            static_cast<std::int16_t>(position.z()), 1};
   std::uint64_t within = 0;
-  for (std::uint64_t rest = cells; rest != 0;) {
-    const unsigned row = static_cast<unsigned>(__builtin_ctzll(rest)) & ~(kSide - 1);
-    const Lanes dx = Eigen::Map<const Lanes>(&block.anchors[0][row]) - x;
-    const Lanes dy = Eigen::Map<const Lanes>(&block.anchors[1][row]) - y;
-    const Lanes dz = Eigen::Map<const Lanes>(&block.anchors[2][row]) - z;
-    within |= LanesAtMost(dx * dx + dy * dy + dz * dz, radius2_units_) << row;
+#if defined(__SSE2__)
+  __m128i from_twice;
+  std::memcpy(&from_twice, from.data(), sizeof(from));
+  from_twice = _mm_unpacklo_epi64(from_twice, from_twice);
+  const __m128i limit = _mm_set1_epi32(radius2_units_);
+  for (std::uint64_t rest = cells; rest != 0;) {  // rows of four cells
+    const unsigned row = static_cast<unsigned>(__builtin_ctzll(rest)) & ~3u;
+    const auto squares = [&](unsigned cell) {  // of two cells: x x + y y, z z
+      const __m128i difference = _mm_sub_epi16(_mm_load_si128(reinterpret_cast<const __m128i*>(&block.anchors[cell])), from_twice);
+      return _mm_castsi128_ps(_mm_madd_epi16(difference, difference));
+    };
+    const __m128 low = squares(row), high = squares(row + 2);
+    const __m128i distance2 = _mm_add_epi32(_mm_castps_si128(_mm_shuffle_ps(low, high, _MM_SHUFFLE(2, 0, 2, 0))),
+                                            _mm_castps_si128(_mm_shuffle_ps(low, high, _MM_SHUFFLE(3, 1, 3, 1))));
+    const int beyond = _mm_movemask_ps(_mm_castsi128_ps(_mm_cmpgt_epi32(distance2, limit)));
+    within |= static_cast<std::uint64_t>(~beyond & 0xf) << row;
     rest &= ~(std::uint64_t{0xf} << row);
   }
+#else
+  for (std::uint64_t rest = cells; rest != 0; rest &= rest - 1) {
+    const unsigned cell = static_cast<unsigned>(__builtin_ctzll(rest));
+    int distance2 = 0;
+    for (std::size_t axis = 0; axis < 3; ++axis) {
+      const int difference = block.anchors[cell][axis] - from[axis];
+      distance2 += difference * difference;
+    }
+    if (distance2 <= radius2_units_) within |= std::uint64_t{1} << cell;
+  }
+#endif
   return within & cells;
 }
 
-/// The voxel takes back what it gave as of its anchor (kWithdraw), and gives anew as of the position, its anchor from now on (kGive).
-/// Its own accumulators get the neighbours that it wins, and lose those that it leaves.
-template <bool kWithdraw, bool kGive>
-void IncrementalNormals::Replace(VoxelHandle voxel, const Position& position) const {
-  const unsigned cell = voxel % kCells;
-  const std::uint32_t home = voxel / kCells;
-  Moments own = blocks_[home].moments[cell];
-  const Position before = blocks_[home].Anchor(cell);
-  const Position& center = cell_centers_[cell];
-  if (!kWithdraw) own = {Eigen::Array4i::Zero(), Eigen::Array4i::Zero(), Eigen::Array4i::Zero()};
-  masks_[home].anchored &= ~(std::uint64_t{1} << cell);  // not a neighbour of its own
-
-  // Blocks lie anywhere in memory: each pass fetches what the next one reads, so that the fetches overlap.
-  const float block_side = static_cast<float>(units_per_cell_) * kSide;
-  reached_.clear();
+/// (3.6) over the anchors around an anchor, itself included, relative to the centre of its cell.
+IncrementalNormals::Moments IncrementalNormals::Gather(VoxelHandle voxel) const {
+  // Blocks lie anywhere in memory: all are asked for before the first is read.
+  struct Reached {
+    std::uint32_t slot;
+    std::uint64_t cells;
+    Position corner;  // relative to the corner of the voxel's block
+  };
+  std::array<Reached, kMostReached> reached;
+  std::size_t count = 0;
+  const int block_side = units_per_cell_ * static_cast<int>(kSide);
   grid_->ForEachStencilBlock(stencil_, voxel, [&](std::uint32_t slot, const NeighbourStencil::BlockVisit& at) {
     const std::uint64_t cells = masks_[slot].anchored & at.cells;
     if (cells == 0) return true;
-    for (const auto& axis : blocks_[slot].anchors)
-      for (unsigned layer = 0; layer < kCells; layer += kSide * kSide)
-        if ((cells >> layer & 0xffff) != 0) __builtin_prefetch(&axis[layer]);
-    const Position corner(at.offset[0] * block_side, at.offset[1] * block_side, at.offset[2] * block_side, 0.f);
-    reached_.push_back({corner, slot, cells, 0, 0});
+    constexpr unsigned kPerLine = 64 / sizeof(PackedPosition);
+    for (unsigned line = 0; line < kCells; line += kPerLine)
+      if ((cells >> line & 0xff) != 0) __builtin_prefetch(&blocks_[slot].anchors[line]);
+    reached[count++] = {slot, cells, Position(at.offset[0], at.offset[1], at.offset[2]) * block_side};
     return true;
   });
-  for (ReachedBlock& reached : reached_) {
-    const Block& other = blocks_[reached.slot];
-    if (kWithdraw) reached.before = CellsWithinRadius(other, reached.cells, before - reached.corner);
-    if (kGive) reached.after = CellsWithinRadius(other, reached.cells, position - reached.corner);
-    for (std::uint64_t cells = reached.before | reached.after; cells != 0; cells &= cells - 1)
-      __builtin_prefetch(&other.moments[__builtin_ctzll(cells)], 1);
+  const Position anchor = AnchorInBlock(voxel), center = CellCenter(voxel);
+  Moments moments;
+  for (std::size_t i = 0; i < count; ++i) {
+    const auto& [slot, cells, corner] = reached[i];
+    const Block& block = blocks_[slot];
+    const Position from_center = corner - center;
+    for (std::uint64_t within = CellsWithinRadius(block, cells, anchor - corner); within != 0; within &= within - 1) {
+      const PackedPosition& there = block.anchors[static_cast<std::size_t>(__builtin_ctzll(within))];
+      const int x = there[0] + from_center.x(), y = there[1] + from_center.y(), z = there[2] + from_center.z();
+      ++moments.count;
+      moments.sum += Position(x, y, z);
+      moments.squares += Position(x * x, y * y, z * z);
+      moments.products += Position(x * y, y * z, z * x);
+    }
   }
-  for (const ReachedBlock& reached : reached_) {
-    Block& other = blocks_[reached.slot];
-    const Position before_there = before - reached.corner, position_there = position - reached.corner;
-    const std::uint64_t both = reached.before & reached.after, lost = reached.before & ~both, won = reached.after & ~both;
-    const Position moved = position - before, sum_there = before_there + position_there;
-    for (std::uint64_t cells = both; kWithdraw && kGive && cells != 0; cells &= cells - 1) {
-      const unsigned neighbour = static_cast<unsigned>(__builtin_ctzll(cells));
-      const Position& there = cell_centers_[neighbour];
-      AccumulateMove(moved, sum_there - there - there, &other.moments[neighbour]);
-    }
-    for (std::uint64_t cells = lost; kWithdraw && cells != 0; cells &= cells - 1) {
-      const unsigned neighbour = static_cast<unsigned>(__builtin_ctzll(cells));
-      Accumulate<-1>(before_there - cell_centers_[neighbour], &other.moments[neighbour]);
-    }
-    for (std::uint64_t cells = won; kGive && cells != 0; cells &= cells - 1) {
-      const unsigned neighbour = static_cast<unsigned>(__builtin_ctzll(cells));
-      Accumulate<1>(position_there - cell_centers_[neighbour], &other.moments[neighbour]);
-    }
-    masks_[reached.slot].stale |= reached.before | reached.after;
-    const Position from_there = reached.corner - center;
-    const auto theirs = [&](std::uint64_t cells) { return other.Anchor(static_cast<unsigned>(__builtin_ctzll(cells))) + from_there; };
-    for (std::uint64_t cells = won; kGive && cells != 0; cells &= cells - 1) Accumulate<1>(theirs(cells), &own);
-    for (std::uint64_t cells = lost; kGive && cells != 0; cells &= cells - 1) Accumulate<-1>(theirs(cells), &own);
-  }
-
-  if (!kGive) return;
-  if (kWithdraw) Accumulate<-1>(before - center, &own);
-  Accumulate<1>(position - center, &own);
-  blocks_[home].moments[cell] = own;
-  for (int axis = 0; axis < 3; ++axis) blocks_[home].anchors[axis][cell] = position.xyz1[axis];
-  masks_[home].anchored |= std::uint64_t{1} << cell;
-  masks_[home].stale |= std::uint64_t{1} << cell;
+  return moments;
 }
 
 bool IncrementalNormals::IsAnchored(VoxelHandle voxel) const {
-  return voxel / kCells < masks_.size() && (masks_[voxel / kCells].anchored >> (voxel % kCells) & 1) != 0;
+  return voxel / kCells < masks_.size() && (masks_[voxel / kCells].anchored & CellBit(voxel)) != 0;
 }
 
-const IncrementalNormals::Moments& IncrementalNormals::MomentsOf(VoxelHandle voxel) const {
+void IncrementalNormals::RefuseUnanchored(VoxelHandle voxel) const {
   if (!IsAnchored(voxel)) throw std::invalid_argument("voxel " + std::to_string(voxel) + " has no normal: it is not active");
-  RenewAround(voxel);
-  return blocks_[voxel / kCells].moments[voxel % kCells];
+}
+
+/// Computes the voxel's normal if it is stale: (3.7) in square units, integers up to the difference.
+void IncrementalNormals::Refresh(VoxelHandle voxel) const {
+  RefuseUnanchored(voxel);
+  Masks& masks = masks_[voxel / kCells];
+  if ((masks.stale & CellBit(voxel)) == 0) return;
+  masks.stale &= ~CellBit(voxel);
+  NormalEstimate& estimate = blocks_[voxel / kCells].estimates[voxel % kCells];
+  float& residual_m = blocks_[voxel / kCells].residuals_m[voxel % kCells];
+  const Moments moments = Gather(voxel);
+  if (moments.count < 3) {
+    const float nan = std::numeric_limits<float>::quiet_NaN();
+    estimate = {Eigen::Vector3f::Constant(nan), nan};
+    residual_m = nan;
+    return;
+  }
+  const double n = moments.count;
+  const Eigen::Vector3d b = moments.sum.cast<double>();
+  const Eigen::Array3d squares = moments.squares.cast<double>(), products = moments.products.cast<double>();
+  Eigen::Matrix3d a;
+  a << squares[0], products[0], products[2],  //
+      products[0], squares[1], products[1],   //
+      products[2], products[1], squares[2];
+  const SmallestEigen eigen = SmallestEigenOf((n * a - b * b.transpose()) / (n * n));
+  estimate = {eigen.vector.cast<float>(), eigen.trace > 0.0 ? static_cast<float>(eigen.value / eigen.trace) : 0.f};
+  residual_m = static_cast<float>(unit_m_ * std::sqrt(eigen.value));
 }
 
 const NormalEstimate& IncrementalNormals::Estimate(VoxelHandle voxel) const {
-  const Moments& moments = MomentsOf(voxel);
-  const std::uint64_t bit = std::uint64_t{1} << (voxel % kCells);
-  NormalEstimate& estimate = blocks_[voxel / kCells].estimates[voxel % kCells];
-  if (masks_[voxel / kCells].stale & bit) {
-    estimate = Compute(moments);
-    masks_[voxel / kCells].stale &= ~bit;
-  }
-  return estimate;
-}
-
-/// (3.7) in square units. Integers up to here: only the difference is rounded.
-Eigen::Matrix3d IncrementalNormals::CovarianceOf(const Moments& moments) const {
-  const double n = moments.squares[3];
-  const Eigen::Vector3d b(moments.sum[0], moments.sum[1], moments.sum[2]);
-  Eigen::Matrix3d a;
-  a << moments.squares[0], moments.products[0], moments.products[2],  //
-      moments.products[0], moments.squares[1], moments.products[1],   //
-      moments.products[2], moments.products[1], moments.squares[2];
-  return (n * a - b * b.transpose()) / (n * n);
-}
-
-NormalEstimate IncrementalNormals::Compute(const Moments& moments) const {
-  if (moments.squares[3] < 3) {
-    const float nan = std::numeric_limits<float>::quiet_NaN();
-    return {Eigen::Vector3f::Constant(nan), nan};
-  }
-  const SmallestEigen eigen = SmallestEigenOf(CovarianceOf(moments));
-  return {eigen.vector.cast<float>(), eigen.trace > 0.0 ? static_cast<float>(eigen.value / eigen.trace) : 0.f};
+  Refresh(voxel);
+  return blocks_[voxel / kCells].estimates[voxel % kCells];
 }
 
 Eigen::Vector3d IncrementalNormals::NormalOdom(VoxelHandle voxel, const Eigen::Vector3d& viewpoint_odom) const {
@@ -313,15 +279,16 @@ Eigen::Vector3d IncrementalNormals::NormalOdom(VoxelHandle voxel, const Eigen::V
   return normal.dot(viewpoint_odom - grid_->CentroidOdom(voxel)) < 0.0 ? Eigen::Vector3d(-normal) : normal;
 }
 
-double IncrementalNormals::PlaneResidual(VoxelHandle voxel) const {
-  const double curvature = Estimate(voxel).curvature;
-  return unit_m_ * std::sqrt(curvature * CovarianceOf(MomentsOf(voxel)).trace());
+float IncrementalNormals::PlaneResidual(VoxelHandle voxel) const {
+  Refresh(voxel);
+  return blocks_[voxel / kCells].residuals_m[voxel % kCells];
 }
 
 NormalAccumulators IncrementalNormals::Accumulators(VoxelHandle voxel) const {
-  const Moments& moments = MomentsOf(voxel);
+  RefuseUnanchored(voxel);
+  const Moments moments = Gather(voxel);
   NormalAccumulators accumulators;
-  accumulators.count = moments.squares[3];
+  accumulators.count = moments.count;
   for (int axis = 0; axis < 3; ++axis) {
     const int next = (axis + 1) % 3;
     accumulators.sum[axis] = moments.sum[axis];
@@ -332,9 +299,8 @@ NormalAccumulators IncrementalNormals::Accumulators(VoxelHandle voxel) const {
 }
 
 Eigen::Vector3i IncrementalNormals::Anchor(VoxelHandle voxel) const {
-  MomentsOf(voxel);  // throws if there is none
-  if ((masks_[voxel / kCells].overdue & CellBit(voxel)) != 0) Renew(voxel);
-  return (blocks_[voxel / kCells].Anchor(voxel % kCells) - cell_centers_[voxel % kCells]).xyz1.head<3>().cast<int>();
+  RefuseUnanchored(voxel);
+  return AnchorInBlock(voxel) - CellCenter(voxel);
 }
 
 }  // namespace incremental_segmatch

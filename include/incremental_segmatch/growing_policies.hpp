@@ -70,7 +70,7 @@ class SmoothnessPolicy {
   /// Curvature or plane residual; NaN, which passes no test, without a normal.
   float Roughness(VoxelHandle voxel) const {
     return measure_ == RoughnessMeasure::kCurvature ? normals_->Estimate(voxel).curvature
-                                                    : static_cast<float>(normals_->PlaneResidual(voxel));
+                                                    : normals_->PlaneResidual(voxel);
   }
 
  private:
