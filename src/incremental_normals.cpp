@@ -196,6 +196,29 @@ std::uint64_t IncrementalNormals::CellsWithinRadius(const Block& block, std::uin
   return within & cells;
 }
 
+/// Adds what two positions contribute.
+void IncrementalNormals::AddPair(const PackedPosition* pair, Moments* moments) {
+#if defined(__SSE2__)
+  const __m128i both = _mm_load_si128(reinterpret_cast<const __m128i*>(pair));
+  const __m128i xyz1 = _mm_unpacklo_epi16(both, _mm_srli_si128(both, 8));  // x x' y y' z z' 1 1
+  const __m128i yzx1 = _mm_shuffle_epi32(xyz1, _MM_SHUFFLE(3, 0, 2, 1));
+  const auto add = [](__m128i products, Eigen::Array4i* sums) {
+    __m128i* const at = reinterpret_cast<__m128i*>(sums->data());
+    _mm_store_si128(at, _mm_add_epi32(_mm_load_si128(at), products));
+  };
+  add(_mm_madd_epi16(xyz1, _mm_set1_epi16(1)), &moments->sum);
+  add(_mm_madd_epi16(xyz1, xyz1), &moments->squares);
+  add(_mm_madd_epi16(xyz1, yzx1), &moments->products);
+#else
+  for (const PackedPosition* p = pair; p != pair + 2; ++p) {
+    const Eigen::Array4i xyz1((*p)[0], (*p)[1], (*p)[2], (*p)[3]), yzx1((*p)[1], (*p)[2], (*p)[0], (*p)[3]);
+    moments->sum += xyz1;
+    moments->squares += xyz1 * xyz1;
+    moments->products += xyz1 * yzx1;
+  }
+#endif
+}
+
 /// (3.6) over the anchors around an anchor, itself included, relative to the centre of its cell.
 IncrementalNormals::Moments IncrementalNormals::Gather(VoxelHandle voxel) const {
   // Blocks lie anywhere in memory: all are asked for before the first is read.
@@ -221,15 +244,17 @@ IncrementalNormals::Moments IncrementalNormals::Gather(VoxelHandle voxel) const 
   for (std::size_t i = 0; i < count; ++i) {
     const auto& [slot, cells, corner] = reached[i];
     const Block& block = blocks_[slot];
-    const Position from_center = corner - center;
+    alignas(16) std::array<PackedPosition, kCells> from_center;
+    std::size_t gathered = 0;
+    const Position shift = corner - center;
     for (std::uint64_t within = CellsWithinRadius(block, cells, anchor - corner); within != 0; within &= within - 1) {
-      const PackedPosition& there = block.anchors[static_cast<std::size_t>(__builtin_ctzll(within))];
-      const int x = there[0] + from_center.x(), y = there[1] + from_center.y(), z = there[2] + from_center.z();
-      ++moments.count;
-      moments.sum += Position(x, y, z);
-      moments.squares += Position(x * x, y * y, z * z);
-      moments.products += Position(x * y, y * z, z * x);
+      PackedPosition position = block.anchors[static_cast<std::size_t>(__builtin_ctzll(within))];
+      for (int axis = 0; axis < 3; ++axis)
+        position[static_cast<std::size_t>(axis)] = static_cast<std::int16_t>(position[static_cast<std::size_t>(axis)] + shift[axis]);
+      from_center[gathered++] = position;
     }
+    if (gathered % 2 != 0) from_center[gathered] = {0, 0, 0, 0};  // never beyond the last: kCells is even
+    for (std::size_t p = 0; p < gathered; p += 2) AddPair(&from_center[p], &moments);
   }
   return moments;
 }
@@ -251,15 +276,15 @@ void IncrementalNormals::Refresh(VoxelHandle voxel) const {
   NormalEstimate& estimate = blocks_[voxel / kCells].estimates[voxel % kCells];
   float& residual_m = blocks_[voxel / kCells].residuals_m[voxel % kCells];
   const Moments moments = Gather(voxel);
-  if (moments.count < 3) {
+  if (moments.sum[3] < 3) {
     const float nan = std::numeric_limits<float>::quiet_NaN();
     estimate = {Eigen::Vector3f::Constant(nan), nan};
     residual_m = nan;
     return;
   }
-  const double n = moments.count;
-  const Eigen::Vector3d b = moments.sum.cast<double>();
-  const Eigen::Array3d squares = moments.squares.cast<double>(), products = moments.products.cast<double>();
+  const double n = moments.sum[3];
+  const Eigen::Vector3d b = moments.sum.head<3>().cast<double>();
+  const Eigen::Array4d squares = moments.squares.cast<double>(), products = moments.products.cast<double>();
   Eigen::Matrix3d a;
   a << squares[0], products[0], products[2],  //
       products[0], squares[1], products[1],   //
@@ -288,7 +313,7 @@ NormalAccumulators IncrementalNormals::Accumulators(VoxelHandle voxel) const {
   RefuseUnanchored(voxel);
   const Moments moments = Gather(voxel);
   NormalAccumulators accumulators;
-  accumulators.count = moments.count;
+  accumulators.count = moments.sum[3];
   for (int axis = 0; axis < 3; ++axis) {
     const int next = (axis + 1) % 3;
     accumulators.sum[axis] = moments.sum[axis];

@@ -125,11 +125,7 @@ void IncrementalSegmenter<Policy>::GrowFromSeed(VoxelHandle seed) {
     const VoxelHandle from = queue_.back();
     queue_.pop_back();
     region_.push_back(from);
-    if constexpr (Policy::kAcceptsAll) {
-      root = VisitNeighbourBlocks(from, root);
-    } else {
-      root = VisitNeighbours(from, root);
-    }
+    root = VisitNeighbours(from, root);
   }
   if (root == kNoLabel) root = NewCluster();
   for (const VoxelHandle voxel : region_) AddVoxel(root, voxel);
@@ -147,22 +143,42 @@ typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::Meet(
   return root == kNoLabel ? FindRoot(other) : Link(root, FindRoot(other));
 }
 
+/// Pending neighbours are queued, clusters are met. Of the voxels of a part, one that the region grows to decides, and none
+/// need be looked at if the region met their cluster before.
 template <class Policy>
 typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::VisitNeighbours(VoxelHandle from, Label root) {
-  grid_->ForEachNeighbour(stencil_, from, [&](VoxelHandle to, const Eigen::Vector3f&) {
-    const bool pending = (BlockOf(to).pending & CellBit(to)) != 0;
-    if (!pending && !IsClustered(to)) return true;  // queued
-    const Label label = pending ? kNoLabel : LabelOf(to);
-    if (label != kNoLabel && root != kNoLabel && FindRoot(label) == root) return true;  // spares asking the policy
-    if (!policy_.CanPointBeSeed(to)) {
-      if (label == kNoLabel) rough_.push_back(to);  // looked at once all regions have grown
-      return true;
+  const float radius2 = static_cast<float>(stencil_.radius_m() * stencil_.radius_m());
+  const float block_size_m = static_cast<float>(DynamicVoxelGrid::kBlockSide * grid_->parameters().resolution_m);
+  const Eigen::Vector3f center = grid_->CentroidInBlock(from);
+  grid_->ForEachStencilBlock(stencil_, from, [&](std::uint32_t slot, const NeighbourStencil::BlockVisit& at) {
+    BlockNode& block = blocks_[slot];
+    if (((block.pending | block.clustered) & at.cells) == 0) return true;
+    const Eigen::Vector3f shift(at.offset[0] * block_size_m - center.x(), at.offset[1] * block_size_m - center.y(),
+                                at.offset[2] * block_size_m - center.z());
+    const auto first_of = [&](std::uint64_t cells) {
+      return slot * DynamicVoxelGrid::kCellsPerBlock + static_cast<VoxelHandle>(__builtin_ctzll(cells));
+    };
+    const auto is_near = [&](VoxelHandle to) { return (grid_->CentroidInBlock(to) + shift).squaredNorm() <= radius2; };
+    for (std::uint64_t cells = block.pending & at.cells; cells != 0; cells &= cells - 1) {
+      const VoxelHandle to = first_of(cells);
+      if (!is_near(to)) continue;
+      if (!policy_.CanPointBeSeed(to)) {
+        rough_.push_back(to);  // looked at once all regions have grown
+      } else if (policy_.CanGrowToPoint(from, to)) {
+        Queue(to);
+      }
     }
-    if (!policy_.CanGrowToPoint(from, to)) return true;
-    if (label == kNoLabel) {
-      Queue(to);
-    } else {
-      root = Meet(root, label);
+    if ((block.clustered & at.cells) == 0) return true;
+    for (Part* part = &block.parts.front(); part != nullptr; part = Next(part)) {
+      std::uint64_t cells = part->cells & at.cells;
+      if (cells == 0) continue;
+      SetLabel(part, FindRoot(part->label));
+      if (part->label == root) continue;
+      const auto grows_to = [&](VoxelHandle to) {
+        return is_near(to) && policy_.CanPointBeSeed(to) && policy_.CanGrowToPoint(from, to);
+      };
+      while (cells != 0 && !grows_to(first_of(cells))) cells &= cells - 1;
+      if (cells != 0) root = Meet(root, part->label);
     }
     return true;
   });
@@ -176,45 +192,14 @@ void IncrementalSegmenter<Policy>::JoinFlattestCluster(VoxelHandle voxel) {
   constexpr VoxelHandle kNone = 0xffffffffu;
   std::pair<float, VoxelHandle> flattest{std::numeric_limits<float>::infinity(), kNone};
   grid_->ForEachNeighbour(stencil_, voxel, [&](VoxelHandle from, const Eigen::Vector3f&) {
-    if (IsClustered(from) && policy_.CanPointBeSeed(from) && policy_.CanGrowToPoint(from, voxel))
-      flattest = std::min(flattest, std::make_pair(policy_.Roughness(from), from));
+    if (!IsClustered(from) || !policy_.CanPointBeSeed(from)) return true;
+    const auto candidate = std::make_pair(policy_.Roughness(from), from);
+    if (candidate < flattest && policy_.CanGrowToPoint(from, voxel)) flattest = candidate;
     return true;
   });
   if (flattest.second == kNone) return;
   BlockOf(voxel).pending &= ~CellBit(voxel);
   AddVoxel(FindRoot(LabelOf(flattest.second)), voxel);
-}
-
-/// The same where every neighbour counts: of the voxels of a part, one within the radius decides, and none need be looked
-/// at if the region met their cluster before.
-template <class Policy>
-typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::VisitNeighbourBlocks(VoxelHandle from, Label root) {
-  const float radius2 = static_cast<float>(stencil_.radius_m() * stencil_.radius_m());
-  const float block_size_m = static_cast<float>(DynamicVoxelGrid::kBlockSide * grid_->parameters().resolution_m);
-  const Eigen::Vector3f center = grid_->CentroidInBlock(from);
-  grid_->ForEachStencilBlock(stencil_, from, [&](std::uint32_t slot, const NeighbourStencil::BlockVisit& at) {
-    BlockNode& block = blocks_[slot];
-    if (((block.pending | block.clustered) & at.cells) == 0) return true;
-    const Eigen::Vector3f shift(at.offset[0] * block_size_m - center.x(), at.offset[1] * block_size_m - center.y(),
-                                at.offset[2] * block_size_m - center.z());
-    const auto first_of = [&](std::uint64_t cells) {
-      return slot * DynamicVoxelGrid::kCellsPerBlock + static_cast<VoxelHandle>(__builtin_ctzll(cells));
-    };
-    const auto is_near = [&](VoxelHandle to) { return (grid_->CentroidInBlock(to) + shift).squaredNorm() <= radius2; };
-    for (std::uint64_t cells = block.pending & at.cells; cells != 0; cells &= cells - 1)
-      if (is_near(first_of(cells))) Queue(first_of(cells));
-    if ((block.clustered & at.cells) == 0) return true;
-    for (Part* part = &block.parts.front(); part != nullptr; part = Next(part)) {
-      std::uint64_t cells = part->cells & at.cells;
-      if (cells == 0) continue;
-      SetLabel(part, FindRoot(part->label));
-      if (part->label == root) continue;
-      while (cells != 0 && !is_near(first_of(cells))) cells &= cells - 1;
-      if (cells != 0) root = Meet(root, part->label);
-    }
-    return true;
-  });
-  return root;
 }
 
 template <class Policy>

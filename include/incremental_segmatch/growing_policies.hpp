@@ -19,7 +19,7 @@ enum class Segmentation {
 
 /// Euclidean clustering: every neighbour within the growing radius belongs to the region.
 struct EuclideanPolicy {
-  /// Every point may seed and be grown to: the segmenter may then settle whole blocks of voxels at once.
+  /// Every point may seed and be grown to.
   static constexpr bool kAcceptsAll = true;
 
   /// Seeds stay in their order.

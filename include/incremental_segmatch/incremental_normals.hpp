@@ -110,10 +110,9 @@ class IncrementalNormals {
   };
   // Sums over a neighbourhood.
   struct Moments {
-    int count = 0;
-    Eigen::Array3i sum = Eigen::Array3i::Zero();       // of x, y, z
-    Eigen::Array3i squares = Eigen::Array3i::Zero();   // of x x, y y, z z
-    Eigen::Array3i products = Eigen::Array3i::Zero();  // of x y, y z, z x
+    Eigen::Array4i sum = Eigen::Array4i::Zero();       // of x, y, z, 1
+    Eigen::Array4i squares = Eigen::Array4i::Zero();   // of x x, y y, z z, 1
+    Eigen::Array4i products = Eigen::Array4i::Zero();  // of x y, y z, z x, 1
   };
 
   bool IsAnchored(VoxelHandle voxel) const;
@@ -125,6 +124,7 @@ class IncrementalNormals {
   void RefuseUnanchored(VoxelHandle voxel) const;
   void Refresh(VoxelHandle voxel) const;
   std::uint64_t CellsWithinRadius(const Block& block, std::uint64_t cells, const Position& position) const;
+  static void AddPair(const PackedPosition* pair, Moments* moments);
   Moments Gather(VoxelHandle voxel) const;
   static std::uint64_t CellBit(VoxelHandle voxel) {
     return std::uint64_t{1} << (voxel % DynamicVoxelGrid::kCellsPerBlock);

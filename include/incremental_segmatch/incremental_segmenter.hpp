@@ -204,7 +204,6 @@ class IncrementalSegmenter final : public Segmenter {
   void RemoveCell(BlockNode* block, std::uint64_t bit);
   Label VisitNeighbours(VoxelHandle from, Label root);
   void JoinFlattestCluster(VoxelHandle voxel);
-  Label VisitNeighbourBlocks(VoxelHandle from, Label root);
   void AddVoxel(Label root, VoxelHandle voxel);
   Label Link(Label a, Label b);
   void MarkDirty(Cluster* cluster);
