@@ -7,7 +7,6 @@
 #include <Eigen/Geometry>
 #include <algorithm>
 #include <cmath>
-#include <cstring>
 #include <limits>
 #include <stdexcept>
 #include <string>
@@ -159,62 +158,57 @@ IncrementalNormals::Position IncrementalNormals::AnchorInBlock(VoxelHandle voxel
   return {anchor[0], anchor[1], anchor[2]};
 }
 
-/// Which of the cells have their anchors within the radius of a position, both relative to the block's corner.
-std::uint64_t IncrementalNormals::CellsWithinRadius(const Block& block, std::uint64_t cells, const Position& position) const {
-  const PackedPosition from{static_cast<std::int16_t>(position.x()), static_cast<std::int16_t>(position.y()),
-                            static_cast<std::int16_t>(position.z()), 1};
-  std::uint64_t within = 0;
+/// Adds the anchors of the cells that lie within the radius around a position, relative to the origin. Both are relative to
+/// the block's corner.
+void IncrementalNormals::AddWithinRadius(const Block& block, std::uint64_t cells, const Position& around, const Position& origin,
+                                         Moments* moments) const {
 #if defined(__SSE2__)
-  __m128i from_twice;
-  std::memcpy(&from_twice, from.data(), sizeof(from));
-  from_twice = _mm_unpacklo_epi64(from_twice, from_twice);
-  const __m128i limit = _mm_set1_epi32(radius2_units_);
-  for (std::uint64_t rest = cells; rest != 0;) {  // rows of four cells
-    const unsigned row = static_cast<unsigned>(__builtin_ctzll(rest)) & ~3u;
-    const auto squares = [&](unsigned cell) {  // of two cells: x x + y y, z z
-      const __m128i difference = _mm_sub_epi16(_mm_load_si128(reinterpret_cast<const __m128i*>(&block.anchors[cell])), from_twice);
+  // Four cells at a time, without a branch: x, y, z, 1 of two of them in one register, and zeros where one does not count.
+  const auto twice = [](const Position& p, int last) {
+    const auto low = [](int value) { return static_cast<std::int16_t>(value); };
+    return _mm_set_epi16(low(last), low(p.z()), low(p.y()), low(p.x()), low(last), low(p.z()), low(p.y()), low(p.x()));
+  };
+  const __m128i around_twice = twice(around, 1), origin_twice = twice(origin, 0), ones = _mm_set1_epi16(1);
+  const __m128i limit = _mm_set1_epi32(radius2_units_), bits = _mm_set_epi32(8, 4, 2, 1);
+  const auto at = [](Eigen::Array4i& sums) { return reinterpret_cast<__m128i*>(sums.data()); };
+  __m128i sum = _mm_loadu_si128(at(moments->sum)), squares = _mm_loadu_si128(at(moments->squares)),
+          products = _mm_loadu_si128(at(moments->products));
+  while (cells != 0) {
+    const unsigned row = static_cast<unsigned>(__builtin_ctzll(cells)) & ~3u;
+    const __m128i* const anchors = reinterpret_cast<const __m128i*>(&block.anchors[row]);
+    const __m128i low = _mm_load_si128(anchors), high = _mm_load_si128(anchors + 1);
+    const auto halves = [&](__m128i pair) {  // of their squared distances: x x + y y, z z
+      const __m128i difference = _mm_sub_epi16(pair, around_twice);
       return _mm_castsi128_ps(_mm_madd_epi16(difference, difference));
     };
-    const __m128 low = squares(row), high = squares(row + 2);
-    const __m128i distance2 = _mm_add_epi32(_mm_castps_si128(_mm_shuffle_ps(low, high, _MM_SHUFFLE(2, 0, 2, 0))),
-                                            _mm_castps_si128(_mm_shuffle_ps(low, high, _MM_SHUFFLE(3, 1, 3, 1))));
-    const int beyond = _mm_movemask_ps(_mm_castsi128_ps(_mm_cmpgt_epi32(distance2, limit)));
-    within |= static_cast<std::uint64_t>(~beyond & 0xf) << row;
-    rest &= ~(std::uint64_t{0xf} << row);
+    const __m128 low_halves = halves(low), high_halves = halves(high);
+    const __m128i distance2 = _mm_add_epi32(_mm_castps_si128(_mm_shuffle_ps(low_halves, high_halves, _MM_SHUFFLE(2, 0, 2, 0))),
+                                            _mm_castps_si128(_mm_shuffle_ps(low_halves, high_halves, _MM_SHUFFLE(3, 1, 3, 1))));
+    const __m128i asked = _mm_and_si128(_mm_set1_epi32(static_cast<int>(cells >> row & 0xf)), bits);
+    const __m128i counts = _mm_andnot_si128(_mm_cmpgt_epi32(distance2, limit), _mm_cmpeq_epi32(asked, bits));
+    const auto add = [&](__m128i pair, __m128i which) {
+      const __m128i p = _mm_and_si128(_mm_sub_epi16(pair, origin_twice), which);
+      const __m128i xyz1 = _mm_unpacklo_epi16(p, _mm_srli_si128(p, 8));  // x x' y y' z z' 1 1
+      const __m128i yzx1 = _mm_shuffle_epi32(xyz1, _MM_SHUFFLE(3, 0, 2, 1));
+      sum = _mm_add_epi32(sum, _mm_madd_epi16(xyz1, ones));
+      squares = _mm_add_epi32(squares, _mm_madd_epi16(xyz1, xyz1));
+      products = _mm_add_epi32(products, _mm_madd_epi16(xyz1, yzx1));
+    };
+    add(low, _mm_unpacklo_epi32(counts, counts));
+    add(high, _mm_unpackhi_epi32(counts, counts));
+    cells &= ~(std::uint64_t{0xf} << row);
   }
+  _mm_storeu_si128(at(moments->sum), sum);
+  _mm_storeu_si128(at(moments->squares), squares);
+  _mm_storeu_si128(at(moments->products), products);
 #else
-  for (std::uint64_t rest = cells; rest != 0; rest &= rest - 1) {
-    const unsigned cell = static_cast<unsigned>(__builtin_ctzll(rest));
-    int distance2 = 0;
-    for (std::size_t axis = 0; axis < 3; ++axis) {
-      const int difference = block.anchors[cell][axis] - from[axis];
-      distance2 += difference * difference;
-    }
-    if (distance2 <= radius2_units_) within |= std::uint64_t{1} << cell;
-  }
-#endif
-  return within & cells;
-}
-
-/// Adds what two positions contribute.
-void IncrementalNormals::AddPair(const PackedPosition* pair, Moments* moments) {
-#if defined(__SSE2__)
-  const __m128i both = _mm_load_si128(reinterpret_cast<const __m128i*>(pair));
-  const __m128i xyz1 = _mm_unpacklo_epi16(both, _mm_srli_si128(both, 8));  // x x' y y' z z' 1 1
-  const __m128i yzx1 = _mm_shuffle_epi32(xyz1, _MM_SHUFFLE(3, 0, 2, 1));
-  const auto add = [](__m128i products, Eigen::Array4i* sums) {
-    __m128i* const at = reinterpret_cast<__m128i*>(sums->data());
-    _mm_store_si128(at, _mm_add_epi32(_mm_load_si128(at), products));
-  };
-  add(_mm_madd_epi16(xyz1, _mm_set1_epi16(1)), &moments->sum);
-  add(_mm_madd_epi16(xyz1, xyz1), &moments->squares);
-  add(_mm_madd_epi16(xyz1, yzx1), &moments->products);
-#else
-  for (const PackedPosition* p = pair; p != pair + 2; ++p) {
-    const Eigen::Array4i xyz1((*p)[0], (*p)[1], (*p)[2], (*p)[3]), yzx1((*p)[1], (*p)[2], (*p)[0], (*p)[3]);
-    moments->sum += xyz1;
-    moments->squares += xyz1 * xyz1;
-    moments->products += xyz1 * yzx1;
+  for (; cells != 0; cells &= cells - 1) {
+    const PackedPosition& anchor = block.anchors[static_cast<std::size_t>(__builtin_ctzll(cells))];
+    const Position there(anchor[0], anchor[1], anchor[2]), p = there - origin;
+    if ((there - around).matrix().squaredNorm() > radius2_units_) continue;
+    moments->sum += Eigen::Array4i(p.x(), p.y(), p.z(), 1);
+    moments->squares += Eigen::Array4i(p.x() * p.x(), p.y() * p.y(), p.z() * p.z(), 1);
+    moments->products += Eigen::Array4i(p.x() * p.y(), p.y() * p.z(), p.z() * p.x(), 1);
   }
 #endif
 }
@@ -243,18 +237,7 @@ IncrementalNormals::Moments IncrementalNormals::Gather(VoxelHandle voxel) const 
   Moments moments;
   for (std::size_t i = 0; i < count; ++i) {
     const auto& [slot, cells, corner] = reached[i];
-    const Block& block = blocks_[slot];
-    alignas(16) std::array<PackedPosition, kCells> from_center;
-    std::size_t gathered = 0;
-    const Position shift = corner - center;
-    for (std::uint64_t within = CellsWithinRadius(block, cells, anchor - corner); within != 0; within &= within - 1) {
-      PackedPosition position = block.anchors[static_cast<std::size_t>(__builtin_ctzll(within))];
-      for (int axis = 0; axis < 3; ++axis)
-        position[static_cast<std::size_t>(axis)] = static_cast<std::int16_t>(position[static_cast<std::size_t>(axis)] + shift[axis]);
-      from_center[gathered++] = position;
-    }
-    if (gathered % 2 != 0) from_center[gathered] = {0, 0, 0, 0};  // never beyond the last: kCells is even
-    for (std::size_t p = 0; p < gathered; p += 2) AddPair(&from_center[p], &moments);
+    AddWithinRadius(blocks_[slot], cells, anchor - corner, center - corner, &moments);
   }
   return moments;
 }

@@ -123,8 +123,8 @@ class IncrementalNormals {
   void MarkStaleAround(VoxelHandle voxel);
   void RefuseUnanchored(VoxelHandle voxel) const;
   void Refresh(VoxelHandle voxel) const;
-  std::uint64_t CellsWithinRadius(const Block& block, std::uint64_t cells, const Position& position) const;
-  static void AddPair(const PackedPosition* pair, Moments* moments);
+  void AddWithinRadius(const Block& block, std::uint64_t cells, const Position& around, const Position& origin,
+                       Moments* moments) const;
   Moments Gather(VoxelHandle voxel) const;
   static std::uint64_t CellBit(VoxelHandle voxel) {
     return std::uint64_t{1} << (voxel % DynamicVoxelGrid::kCellsPerBlock);
