@@ -164,7 +164,7 @@ class SegmenterSequences : public ::testing::TestWithParam<BoundaryPolicy> {};
 
 TEST_P(SegmenterSequences, ClustersAreComponentsAndIdsFollowTheRules) {
   std::size_t renamings = 0, retirements = 0, too_large = 0, trails = 0;
-  for (unsigned seed = 0; seed < 400; ++seed) {
+  for (unsigned seed = 0; seed < 1000; ++seed) {
     SCOPED_TRACE("seed " + std::to_string(seed));
     std::mt19937 random(seed);
     DynamicVoxelGridParameters grid_parameters;
