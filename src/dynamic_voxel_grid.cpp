@@ -25,9 +25,13 @@ constexpr int kSide = DynamicVoxelGrid::kBlockSide;
 constexpr int kBlocksPerTileSide = 8;
 constexpr int kLinkCenter = 13;  // index of the block itself among its 27 links
 
-int LinkIndex(int dx, int dy, int dz) { return kLinkCenter + dx + 3 * dy + 9 * dz; }
+int LinkIndex(int dx, int dy, int dz) {
+  return kLinkCenter + dx + 3 * dy + 9 * dz;
+}
 
-int FloorDivide(int value, int divisor) { return value >= 0 ? value / divisor : -((divisor - 1 - value) / divisor); }
+int FloorDivide(int value, int divisor) {
+  return value >= 0 ? value / divisor : -((divisor - 1 - value) / divisor);
+}
 
 std::uint64_t PackTile(int x, int y) {
   return (static_cast<std::uint64_t>(static_cast<std::uint32_t>(x)) << 32) | static_cast<std::uint32_t>(y);
@@ -37,7 +41,8 @@ std::uint64_t PackTile(int x, int y) {
 constexpr int kBlockBits = 21;
 
 std::uint64_t PackCoordinate(std::int32_t coordinate, int axis) {
-  return static_cast<std::uint64_t>(static_cast<std::uint32_t>(coordinate) & ((1u << kBlockBits) - 1)) << (kBlockBits * axis);
+  return static_cast<std::uint64_t>(static_cast<std::uint32_t>(coordinate) & ((1u << kBlockBits) - 1))
+         << (kBlockBits * axis);
 }
 
 std::uint64_t PackBlock(const std::array<std::int32_t, 3>& c) {
@@ -46,7 +51,8 @@ std::uint64_t PackBlock(const std::array<std::int32_t, 3>& c) {
 
 std::array<std::int32_t, 3> UnpackBlock(std::uint64_t key) {
   const auto coordinate = [key](int axis) {  // its sign is its highest bit
-    return static_cast<std::int32_t>(static_cast<std::uint32_t>(key >> (kBlockBits * axis)) << (32 - kBlockBits)) >> (32 - kBlockBits);
+    return static_cast<std::int32_t>(static_cast<std::uint32_t>(key >> (kBlockBits * axis)) << (32 - kBlockBits)) >>
+           (32 - kBlockBits);
   };
   return {coordinate(0), coordinate(1), coordinate(2)};
 }
@@ -198,7 +204,8 @@ class DynamicVoxelGrid::TileMap {
   }
 
   std::size_t memory_bytes() const {
-    std::size_t bytes = tiles_.size() * (sizeof(Tile) + 32) + waiting_.size() * sizeof(std::pair<double, std::uint32_t>);
+    std::size_t bytes =
+        tiles_.size() * (sizeof(Tile) + 32) + waiting_.size() * sizeof(std::pair<double, std::uint32_t>);
     for (const Tile& tile : tiles_) bytes += tile.blocks.capacity() * sizeof(std::uint32_t);
     return bytes;
   }
@@ -259,8 +266,8 @@ struct DynamicVoxelGrid::Runs {
 };
 
 VoxelUpdate DynamicVoxelGrid::Insert(const Points& points_sensor, const Pose& T_odom_sensor) {
-  // Blocks lie anywhere in memory. A chunk of points at a time, everything that a pass over the chunk needs was asked for by the
-  // pass before it, so that the fetches overlap instead of following each other.
+  // Blocks lie anywhere in memory. A chunk of points at a time, everything that a pass over the chunk needs was asked
+  // for by the pass before it, so that the fetches overlap instead of following each other.
   VoxelUpdate update;
   ++insertions_;
   Chunk chunk;
@@ -289,7 +296,8 @@ DynamicVoxelGrid::CellTransform DynamicVoxelGrid::CellTransformOf(const Pose& T_
   const double cells_per_m = 1.0 / parameters_.resolution_m;
   CellTransform transform;
   for (int row = 0; row < 3; ++row) {
-    for (int column = 0; column < 3; ++column) transform.R[row][column] = cells_per_m * T_grid_sensor.linear()(row, column);
+    for (int column = 0; column < 3; ++column)
+      transform.R[row][column] = cells_per_m * T_grid_sensor.linear()(row, column);
     transform.t[row] = cells_per_m * (T_grid_sensor.translation()[row] - center[row]);
     transform.half_cells[row] = std::ldexp(1.0, parameters_.bits[row] - 1);
   }
@@ -315,7 +323,8 @@ void DynamicVoxelGrid::Locate(const CellTransform& transform, Chunk* chunk) {
     const double low = -transform.half_cells[axis], high = transform.half_cells[axis];
     float* const in_block = chunk->in_block[axis].data();
     for (std::size_t i = 0; i < count; ++i) {
-      const double exact = rx * static_cast<double>(x[i]) + ry * static_cast<double>(y[i]) + rz * static_cast<double>(z[i]) + t;
+      const double exact =
+          rx * static_cast<double>(x[i]) + ry * static_cast<double>(y[i]) + rz * static_cast<double>(z[i]) + t;
       double cells = exact >= low ? exact : low;  // also where it is no number
       cells = cells < high ? cells : low;
       std::int32_t index = static_cast<std::int32_t>(cells);
@@ -352,7 +361,8 @@ void DynamicVoxelGrid::MergeRuns(const Chunk& chunk, Runs* runs) {
     count += leaves_voxel;
     visits += leaves_block;
     begin += leaves_voxel * (static_cast<std::uint32_t>(i) - begin);
-    sum = static_cast<float>(1 - leaves_voxel) * sum + Eigen::Vector3f(chunk.in_block[0][i], chunk.in_block[1][i], chunk.in_block[2][i]);
+    sum = static_cast<float>(1 - leaves_voxel) * sum +
+          Eigen::Vector3f(chunk.in_block[0][i], chunk.in_block[1][i], chunk.in_block[2][i]);
     last_block = chunk.block[i];
     last_cell = chunk.cell[i];
     runs->block[visits] = last_block;
@@ -457,8 +467,8 @@ VoxelUpdate DynamicVoxelGrid::RemoveOutside(const Eigen::Vector3d& center_odom, 
   return update;
 }
 
-/// The tiles that a circle in the grid's x-y plane, removal's boundary, leaves out, or cuts. A tile that lies inside with some
-/// room is not looked at again before the circle has moved, or shrunk, by so much altogether.
+/// The tiles that a circle in the grid's x-y plane, removal's boundary, leaves out, or cuts. A tile that lies inside
+/// with some room is not looked at again before the circle has moved, or shrunk, by so much altogether.
 std::vector<std::uint32_t> DynamicVoxelGrid::TilesAtBoundary(const Eigen::Vector2d& center, double radius_m) {
   constexpr double kRoundingM = 1e-6;
   advance_m_ += (center - last_center_).norm() + std::max(0.0, last_radius_m_ - radius_m);
@@ -524,7 +534,8 @@ std::uint32_t DynamicVoxelGrid::AddBlock(const std::array<std::int32_t, 3>& coor
       }
   SetLink(slot, kLinkCenter, slot);
   block_map_->Insert(PackBlock(coordinates), slot);
-  added.tile = tiles_->FindOrAdd(FloorDivide(coordinates[0], kBlocksPerTileSide), FloorDivide(coordinates[1], kBlocksPerTileSide));
+  added.tile = tiles_->FindOrAdd(FloorDivide(coordinates[0], kBlocksPerTileSide),
+                                 FloorDivide(coordinates[1], kBlocksPerTileSide));
   std::vector<std::uint32_t>& members = tiles_->tile(added.tile).blocks;
   added.position_in_tile = static_cast<std::uint32_t>(members.size());
   members.push_back(slot);
@@ -550,11 +561,14 @@ void DynamicVoxelGrid::RemoveBlock(std::uint32_t slot) {
   free_blocks_.push_back(slot);
 }
 
-std::size_t DynamicVoxelGrid::handle_capacity() const { return std::size_t{block_slots_} * kCellsPerBlock; }
+std::size_t DynamicVoxelGrid::handle_capacity() const {
+  return std::size_t{block_slots_} * kCellsPerBlock;
+}
 
 std::size_t DynamicVoxelGrid::memory_bytes() const {
   return blocks_.memory_bytes() + links_.memory_bytes() + voxels_.memory_bytes() +
-         free_blocks_.capacity() * sizeof(std::uint32_t) + block_map_->memory_bytes() + tiles_->memory_bytes() + touched_inactive_.capacity() * sizeof(VoxelHandle);
+         free_blocks_.capacity() * sizeof(std::uint32_t) + block_map_->memory_bytes() + tiles_->memory_bytes() +
+         touched_inactive_.capacity() * sizeof(VoxelHandle);
 }
 
 bool DynamicVoxelGrid::IsActive(VoxelHandle voxel) const {

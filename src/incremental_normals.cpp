@@ -18,7 +18,8 @@ constexpr VoxelHandle kCells = DynamicVoxelGrid::kCellsPerBlock;
 constexpr int kSide = DynamicVoxelGrid::kBlockSide;
 constexpr std::size_t kMostReached = 7 * 7 * 7;  // blocks around a voxel, by a radius of 8 voxels
 
-/// The finest power of two of units per cell for which all sums over a full neighbourhood fit 32 bits. A neighbour lies within the radius of a point that is at most half a cell from the reference, on each axis.
+/// The finest power of two of units per cell for which all sums over a full neighbourhood fit 32 bits. A neighbour lies
+/// within the radius of a point that is at most half a cell from the reference, on each axis.
 int UnitsPerCell(const NeighbourStencil& stencil, double radius_cells) {
   std::size_t most_neighbours = 0;
   for (unsigned cell = 0; cell < kCells; ++cell) {
@@ -41,8 +42,8 @@ int UnitsPerCell(const NeighbourStencil& stencil, double radius_cells) {
 SmallestEigen SmallestEigenOf(const Eigen::Matrix3d& m) {
   SmallestEigen result{Eigen::Vector3d::UnitZ(), 0.0, m.trace()};
   if (!(result.trace > 0.0)) return result;
-  // Laguerre's iteration on p(x) = det(m - x) = c0 - c1 x + c2 x^2 - x^3 rises monotonically from 0 to the smallest root, and
-  // cubically near it: all roots are real.
+  // Laguerre's iteration on p(x) = det(m - x) = c0 - c1 x + c2 x^2 - x^3 rises monotonically from 0 to the smallest
+  // root, and cubically near it: all roots are real.
   const double c0 = m.determinant(), c2 = result.trace;
   const double c1 = m(0, 0) * m(1, 1) - m(0, 1) * m(0, 1) + m(0, 0) * m(2, 2) - m(0, 2) * m(0, 2) + m(1, 1) * m(2, 2) -
                     m(1, 2) * m(1, 2);
@@ -62,7 +63,8 @@ SmallestEigen SmallestEigenOf(const Eigen::Matrix3d& m) {
   // The vector is perpendicular to all rows of m - x: the longest product of two of them is the most accurate.
   Eigen::Matrix3d rows = m;
   rows.diagonal().array() -= x;
-  const Eigen::Vector3d a = rows.row(0).cross(rows.row(1)), b = rows.row(0).cross(rows.row(2)), c = rows.row(1).cross(rows.row(2));
+  const Eigen::Vector3d a = rows.row(0).cross(rows.row(1)), b = rows.row(0).cross(rows.row(2)),
+                        c = rows.row(1).cross(rows.row(2));
   const double aa = a.squaredNorm(), bb = b.squaredNorm(), cc = c.squaredNorm();
   const double longest2 = std::max({aa, bb, cc});
   if (longest2 > 1e-24 * std::pow(result.trace, 4)) {
@@ -81,15 +83,16 @@ IncrementalNormals::IncrementalNormals(const NormalsParameters& parameters, cons
   const double resolution_m = grid.parameters().resolution_m;
   const double radius_cells = parameters.radius_m / resolution_m;
   if (!(radius_cells <= 8.0))
-    throw std::invalid_argument("normals.radius_m: must be at most 8 voxels of " + std::to_string(resolution_m) + " m, is " +
-                                std::to_string(parameters.radius_m));
+    throw std::invalid_argument("normals.radius_m: must be at most 8 voxels of " + std::to_string(resolution_m) +
+                                " m, is " + std::to_string(parameters.radius_m));
   if (!(parameters.renewal_tolerance_voxels >= 0.0))
     throw std::invalid_argument("normals.renewal_tolerance_voxels: must not be negative, is " +
                                 std::to_string(parameters.renewal_tolerance_voxels));
   units_per_cell_ = UnitsPerCell(stencil_, radius_cells);
   unit_m_ = resolution_m / units_per_cell_;
   units_per_m_ = static_cast<float>(1.0 / unit_m_);
-  const double radius_units = radius_cells * units_per_cell_ * (1.0 + 1e-9);  // radii that are whole voxels are whole units
+  const double radius_units =
+      radius_cells * units_per_cell_ * (1.0 + 1e-9);  // radii that are whole voxels are whole units
   radius2_units_ = static_cast<int>(radius_units * radius_units);
   const double tolerance_units = parameters.renewal_tolerance_voxels * units_per_cell_;
   tolerance2_units_ = static_cast<float>(tolerance_units * tolerance_units);
@@ -127,7 +130,8 @@ void IncrementalNormals::Insert(const VoxelUpdate& update) {
 
 void IncrementalNormals::SetAnchor(VoxelHandle voxel, const Position& position) {
   PackedPosition& anchor = blocks_[voxel / kCells].anchors[voxel % kCells];
-  for (int axis = 0; axis < 3; ++axis) anchor[static_cast<std::size_t>(axis)] = static_cast<std::int16_t>(position[axis]);
+  for (int axis = 0; axis < 3; ++axis)
+    anchor[static_cast<std::size_t>(axis)] = static_cast<std::int16_t>(position[axis]);
   anchor[3] = 1;
   MarkStaleAround(voxel);
 }
@@ -158,12 +162,13 @@ IncrementalNormals::Position IncrementalNormals::AnchorInBlock(VoxelHandle voxel
   return {anchor[0], anchor[1], anchor[2]};
 }
 
-/// Adds the anchors of the cells that lie within the radius around a position, relative to the origin. Both are relative to
-/// the block's corner.
-void IncrementalNormals::AddWithinRadius(const Block& block, std::uint64_t cells, const Position& around, const Position& origin,
-                                         Moments* moments) const {
+/// Adds the anchors of the cells that lie within the radius around a position, relative to the origin. Both are
+/// relative to the block's corner.
+void IncrementalNormals::AddWithinRadius(const Block& block, std::uint64_t cells, const Position& around,
+                                         const Position& origin, Moments* moments) const {
 #if defined(__SSE2__)
-  // Four cells at a time, without a branch: x, y, z, 1 of two of them in one register, and zeros where one does not count.
+  // Four cells at a time, without a branch: x, y, z, 1 of two of them in one register, and zeros where one does not
+  // count.
   const auto twice = [](const Position& p, int last) {
     const auto low = [](int value) { return static_cast<std::int16_t>(value); };
     return _mm_set_epi16(low(last), low(p.z()), low(p.y()), low(p.x()), low(last), low(p.z()), low(p.y()), low(p.x()));
@@ -182,8 +187,9 @@ void IncrementalNormals::AddWithinRadius(const Block& block, std::uint64_t cells
       return _mm_castsi128_ps(_mm_madd_epi16(difference, difference));
     };
     const __m128 low_halves = halves(low), high_halves = halves(high);
-    const __m128i distance2 = _mm_add_epi32(_mm_castps_si128(_mm_shuffle_ps(low_halves, high_halves, _MM_SHUFFLE(2, 0, 2, 0))),
-                                            _mm_castps_si128(_mm_shuffle_ps(low_halves, high_halves, _MM_SHUFFLE(3, 1, 3, 1))));
+    const __m128i distance2 =
+        _mm_add_epi32(_mm_castps_si128(_mm_shuffle_ps(low_halves, high_halves, _MM_SHUFFLE(2, 0, 2, 0))),
+                      _mm_castps_si128(_mm_shuffle_ps(low_halves, high_halves, _MM_SHUFFLE(3, 1, 3, 1))));
     const __m128i asked = _mm_and_si128(_mm_set1_epi32(static_cast<int>(cells >> row & 0xf)), bits);
     const __m128i counts = _mm_andnot_si128(_mm_cmpgt_epi32(distance2, limit), _mm_cmpeq_epi32(asked, bits));
     const auto add = [&](__m128i pair, __m128i which) {
@@ -247,7 +253,8 @@ bool IncrementalNormals::IsAnchored(VoxelHandle voxel) const {
 }
 
 void IncrementalNormals::RefuseUnanchored(VoxelHandle voxel) const {
-  if (!IsAnchored(voxel)) throw std::invalid_argument("voxel " + std::to_string(voxel) + " has no normal: it is not active");
+  if (!IsAnchored(voxel))
+    throw std::invalid_argument("voxel " + std::to_string(voxel) + " has no normal: it is not active");
 }
 
 /// Computes the voxel's normal if it is stale: (3.7) in square units, integers up to the difference.

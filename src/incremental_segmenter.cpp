@@ -143,10 +143,11 @@ typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::Meet(
   return root == kNoLabel ? FindRoot(other) : Link(root, FindRoot(other));
 }
 
-/// Pending neighbours are queued, clusters are met. Of the voxels of a part, one that the region grows to decides, and none
-/// need be looked at if the region met their cluster before.
+/// Pending neighbours are queued, clusters are met. Of the voxels of a part, one that the region grows to decides, and
+/// none need be looked at if the region met their cluster before.
 template <class Policy>
-typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::VisitNeighbours(VoxelHandle from, Label root) {
+typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::VisitNeighbours(VoxelHandle from,
+                                                                                           Label root) {
   const float radius2 = static_cast<float>(stencil_.radius_m() * stencil_.radius_m());
   const float block_size_m = static_cast<float>(DynamicVoxelGrid::kBlockSide * grid_->parameters().resolution_m);
   const Eigen::Vector3f center = grid_->CentroidInBlock(from);
@@ -185,8 +186,8 @@ typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::Visit
   return root;
 }
 
-/// A point that may not seed: it joins a cluster, but neither links two nor lets others follow, so that the order of such points
-/// does not matter.
+/// A point that may not seed: it joins a cluster, but neither links two nor lets others follow, so that the order of
+/// such points does not matter.
 template <class Policy>
 void IncrementalSegmenter<Policy>::JoinFlattestCluster(VoxelHandle voxel) {
   constexpr VoxelHandle kNone = 0xffffffffu;
@@ -321,8 +322,8 @@ void IncrementalSegmenter<Policy>::AddVoxel(Label root, VoxelHandle voxel) {
   MarkDirty(&cluster);
 }
 
-/// LinkPartialClusters: both roots' sets become one. What that means for segment IDs is settled at the end of the call, so that
-/// it does not depend on the order in which clusters meet.
+/// LinkPartialClusters: both roots' sets become one. What that means for segment IDs is settled at the end of the call,
+/// so that it does not depend on the order in which clusters meet.
 template <class Policy>
 typename IncrementalSegmenter<Policy>::Label IncrementalSegmenter<Policy>::Link(Label a, Label b) {
   if (a == b) return a;
@@ -414,11 +415,16 @@ void IncrementalSegmenter<Policy>::SettleCluster(ClusterIndex index, SegmentUpda
 template <class Policy>
 std::size_t& IncrementalSegmenter<Policy>::CountOf(State state) {
   switch (state) {
-    case State::kSmall: return counts_.too_small;
-    case State::kSegment: return counts_.segments;
-    case State::kTooLarge: return counts_.too_large;
-    case State::kTrail: return counts_.trails;
-    default: return counts_.cut;
+    case State::kSmall:
+      return counts_.too_small;
+    case State::kSegment:
+      return counts_.segments;
+    case State::kTooLarge:
+      return counts_.too_large;
+    case State::kTrail:
+      return counts_.trails;
+    default:
+      return counts_.cut;
   }
 }
 
@@ -453,7 +459,8 @@ void IncrementalSegmenter<Policy>::Untrack(SegmentId segment) {
 }
 
 template <class Policy>
-typename IncrementalSegmenter<Policy>::ClusterIndex IncrementalSegmenter<Policy>::TrackedIndex(SegmentId segment) const {
+typename IncrementalSegmenter<Policy>::ClusterIndex IncrementalSegmenter<Policy>::TrackedIndex(
+    SegmentId segment) const {
   const auto at = std::lower_bound(tracked_.begin(), tracked_.end(), std::make_pair(segment, ClusterIndex{0}));
   if (at == tracked_.end() || at->first != segment)
     throw std::invalid_argument("segment " + std::to_string(segment) + " is not tracked");
@@ -486,9 +493,9 @@ std::vector<SegmentId> IncrementalSegmenter<Policy>::Segments() const {
 
 template <class Policy>
 std::size_t IncrementalSegmenter<Policy>::memory_bytes() const {
-  return nodes_.capacity() * sizeof(Node) + free_nodes_.capacity() * sizeof(Label) + clusters_.capacity() * sizeof(Cluster) +
-         free_clusters_.capacity() * sizeof(ClusterIndex) + blocks_.memory_bytes() + more_parts_.memory_bytes() +
-         free_parts_.capacity() * sizeof(std::uint32_t) +
+  return nodes_.capacity() * sizeof(Node) + free_nodes_.capacity() * sizeof(Label) +
+         clusters_.capacity() * sizeof(Cluster) + free_clusters_.capacity() * sizeof(ClusterIndex) +
+         blocks_.memory_bytes() + more_parts_.memory_bytes() + free_parts_.capacity() * sizeof(std::uint32_t) +
          (seeds_.capacity() + queue_.capacity() + region_.capacity() + rough_.capacity()) * sizeof(VoxelHandle);
 }
 

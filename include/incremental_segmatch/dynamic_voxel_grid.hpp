@@ -61,9 +61,9 @@ class NeighbourStencil {
   };
   /// Of a cell of a block (0 to 63): the blocks that hold cells within the radius.
   struct Neighbourhood {
-    std::uint32_t links = 0;                    ///< which of adjacent, by the indices of their links
-    std::array<BlockVisit, 27> adjacent;        ///< those next to the block, and itself, by link
-    std::vector<BlockVisit> farther;            ///< those that must be looked up
+    std::uint32_t links = 0;              ///< which of adjacent, by the indices of their links
+    std::array<BlockVisit, 27> adjacent;  ///< those next to the block, and itself, by link
+    std::vector<BlockVisit> farther;      ///< those that must be looked up
   };
   /// Around a cell.
   const Neighbourhood& around(unsigned cell) const { return around_[cell]; }
@@ -135,9 +135,7 @@ class DynamicVoxelGrid {
             c[2] * side_m + parameters_.center_m[2]};
   }
   /// Centroid relative to BlockCorner.
-  const Eigen::Vector3f& CentroidInBlock(VoxelHandle voxel) const {
-    return VoxelAt(voxel).centroid_block;
-  }
+  const Eigen::Vector3f& CentroidInBlock(VoxelHandle voxel) const { return VoxelAt(voxel).centroid_block; }
   /// Centroid in the grid's frame.
   Eigen::Vector3d CentroidGrid(VoxelHandle voxel) const {
     return BlockCorner(voxel) + CentroidInBlock(voxel).cast<double>();
@@ -173,9 +171,9 @@ class DynamicVoxelGrid {
     std::uint32_t count;
   };
   struct alignas(64) Block {
-    std::uint64_t occupied = 0;  ///< cells with at least one point
-    std::uint64_t active = 0;    ///< cells with at least min_points_per_voxel
-    std::uint64_t touched = 0;   ///< cells that got points in the last insertion
+    std::uint64_t occupied = 0;        ///< cells with at least one point
+    std::uint64_t active = 0;          ///< cells with at least min_points_per_voxel
+    std::uint64_t touched = 0;         ///< cells that got points in the last insertion
     std::uint32_t last_insertion = 0;  ///< that brought points
     std::array<std::int32_t, 3> coordinates{};
     std::uint32_t tile = 0;
@@ -243,8 +241,8 @@ void DynamicVoxelGrid::ForEachStencilBlock(const NeighbourStencil& stencil, Voxe
     if (!visit(links[link], around.adjacent[link])) return;
   }
   for (const NeighbourStencil::BlockVisit& at : around.farther) {
-    const std::uint32_t slot = FindBlock({home.coordinates[0] + at.offset[0], home.coordinates[1] + at.offset[1],
-                                          home.coordinates[2] + at.offset[2]});
+    const std::uint32_t slot = FindBlock(
+        {home.coordinates[0] + at.offset[0], home.coordinates[1] + at.offset[1], home.coordinates[2] + at.offset[2]});
     if (slot != kNoBlock && !visit(slot, at)) return;
   }
 }

@@ -43,8 +43,8 @@ enum class RoughnessMeasure {
 struct SmoothnessParameters {
   double max_angle_rad = 0.14;  ///< between the normals of neighbours in a region, up to pi/2
   RoughnessMeasure measure = RoughnessMeasure::kCurvature;  ///< what is compared with the next two
-  double max_curvature = 0.05;   ///< with kCurvature: a rougher point does not seed
-  double max_residual_m = 0.03;  ///< with kPlaneResidual: a rougher point does not seed
+  double max_curvature = 0.05;                              ///< with kCurvature: a rougher point does not seed
+  double max_residual_m = 0.03;                             ///< with kPlaneResidual: a rougher point does not seed
 };
 
 /// Smoothness constraints (Rabbani et al.; thesis 3.3.5): regions grow from their flattest points along normals that

@@ -60,8 +60,8 @@ SmallestEigen SmallestEigenOf(const Eigen::Matrix3d& matrix);
 /// and b <- n t + R b, and N <- R N are what one gets by expressing them in the new frame, and nothing need be done;
 /// NormalOdom rotates when it is read.
 ///
-/// Cost: Insert and Remove O(changed) with the few blocks around each; reading O(1), and O(neighbours) for a stale normal.
-/// Not thread-safe, not even for reading. The grid must outlive this object.
+/// Cost: Insert and Remove O(changed) with the few blocks around each; reading O(1), and O(neighbours) for a stale
+/// normal. Not thread-safe, not even for reading. The grid must outlive this object.
 class IncrementalNormals {
  public:
   /// Throws std::invalid_argument naming the parameter that is out of range.
@@ -96,7 +96,8 @@ class IncrementalNormals {
   std::size_t memory_bytes() const { return blocks_.memory_bytes() + masks_.capacity() * sizeof(Masks); }
 
  private:
-  // Positions are in units, integers throughout. Anchors are relative to their block's corner, accumulators to their cell's centre.
+  // Positions are in units, integers throughout. Anchors are relative to their block's corner, accumulators to their
+  // cell's centre.
   using Position = Eigen::Array3i;
   using PackedPosition = std::array<std::int16_t, 4>;  // x, y, z, 1
   struct alignas(64) Block {

@@ -82,8 +82,8 @@ class Segmenter {
   virtual SegmentUpdate Insert(const VoxelUpdate& update) = 0;
 
   /// Segments turned out to be trails of moving objects: they are segments no more. What such a cluster merges with
-  /// stays, or becomes, what it is: a segment goes on with the trail as a part of it. Throws std::invalid_argument if one
-  /// is not tracked. O(trails log segments).
+  /// stays, or becomes, what it is: a segment goes on with the trail as a part of it. Throws std::invalid_argument if
+  /// one is not tracked. O(trails log segments).
   virtual SegmentUpdate DismissTrails(const std::vector<SegmentId>& trails) = 0;
 
   /// Sums over a segment's voxels. O(1).
@@ -105,8 +105,9 @@ class Segmenter {
 /// and accepted by the policy, when the later of the two was clustered"; a cluster never splits. Where the policy lets
 /// not every point seed, only points that may seed link; one that may not joins the flattest of the points around it
 /// that accept it, alone. Union-find over labels persists between calls; labels and clusters are reference-counted and
-/// reclaimed. Labels are carried by parts of the grid's blocks, so that many voxels can be settled at once. Remove is O(removed), Insert O(activated * neighbours + moved), both nearly. Not thread-safe. The grid
-/// must outlive the segmenter.
+/// reclaimed. Labels are carried by parts of the grid's blocks, so that many voxels can be settled at once. Remove is
+/// O(removed), Insert O(activated * neighbours + moved), both nearly. Not thread-safe. The grid must outlive the
+/// segmenter.
 template <class Policy>
 class IncrementalSegmenter final : public Segmenter {
  public:
@@ -146,8 +147,8 @@ class IncrementalSegmenter final : public Segmenter {
     bool grew = false;
     SegmentId id = kNoSegment;
     Label root = kNoLabel;
-    std::uint32_t live_voxels = 0;  // in the local map now
-    SegmentMoments moments;         // kTooLarge: of the voxels until then, nobody will read them again
+    std::uint32_t live_voxels = 0;    // in the local map now
+    SegmentMoments moments;           // kTooLarge: of the voxels until then, nobody will read them again
     std::vector<SegmentId> absorbed;  // IDs of segments that merged into it in this call
   };
   // Clustered voxels of a block that carry one label.
@@ -166,7 +167,8 @@ class IncrementalSegmenter final : public Segmenter {
   };
 
   bool IsClustered(VoxelHandle voxel) const {
-    return voxel / DynamicVoxelGrid::kCellsPerBlock < blocks_.size() && (BlockOf(voxel).clustered & CellBit(voxel)) != 0;
+    return voxel / DynamicVoxelGrid::kCellsPerBlock < blocks_.size() &&
+           (BlockOf(voxel).clustered & CellBit(voxel)) != 0;
   }
   // The block's part after this one; null after the last.
   const Part* Next(const Part* part) const {

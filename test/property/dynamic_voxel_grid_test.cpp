@@ -1,4 +1,5 @@
-// Contract 1 of the voxel grid: after any sequence of insertion, removal and transform it equals a map from cell to points.
+// Contract 1 of the voxel grid: after any sequence of insertion, removal and transform it equals a map from cell to
+// points.
 
 #include "incremental_segmatch/dynamic_voxel_grid.hpp"
 
@@ -111,7 +112,8 @@ TEST(DynamicVoxelGrid, EqualsMapFromCellToPointsAfterAnySequence) {
         const Eigen::Vector3d odom = reference.T_odom_grid * (center + walker);
         const double radius_m = std::uniform_real_distribution<double>(walks ? 2.0 : 0.5, 4.0)(random);
         const Eigen::Vector3d around = reference.T_odom_grid.inverse() * odom;
-        const std::uint32_t oldest = walks ? 0 : std::uniform_int_distribution<std::uint32_t>(0, grid.insertions())(random);
+        const std::uint32_t oldest =
+            walks ? 0 : std::uniform_int_distribution<std::uint32_t>(0, grid.insertions())(random);
         const VoxelUpdate update = grid.RemoveOutside(odom, radius_m, oldest);
         EXPECT_TRUE(update.activated.empty() && update.moved.empty());
         std::set<Cell> expected;
@@ -188,11 +190,13 @@ TEST(DynamicVoxelGrid, NeighboursEqualExhaustiveSearch) {
     parameters.min_points_per_voxel = 1 + static_cast<int>(seed % 2);
     DynamicVoxelGrid grid(parameters);
     // Radii on both sides of a block's side, and exact multiples of the resolution.
-    const double radius_m = seed % 3 == 0 ? 0.1 * (1 + seed % 8) : std::uniform_real_distribution<double>(0.02, 1.2)(random);
+    const double radius_m =
+        seed % 3 == 0 ? 0.1 * (1 + seed % 8) : std::uniform_real_distribution<double>(0.02, 1.2)(random);
     const NeighbourStencil stencil(radius_m, parameters.resolution_m);
     std::uniform_real_distribution<float> coordinate(-1.f, 1.f);
     Points points;
-    for (int i = 0; i < 120; ++i) points.emplace_back(coordinate(random), coordinate(random), 0.5f * coordinate(random));
+    for (int i = 0; i < 120; ++i)
+      points.emplace_back(coordinate(random), coordinate(random), 0.5f * coordinate(random));
     grid.Insert(points, Pose::Identity());
     grid.RemoveOutside({0.3, 0.0, 0.0}, 1.0);
     const std::vector<VoxelHandle> voxels = grid.ActiveVoxels();
@@ -229,7 +233,8 @@ TEST(DynamicVoxelGrid, FarFromTheOriginNothingIsLost) {
     centroid_offsets.push_back(offsets);
   }
   ASSERT_EQ(centroid_offsets[0].size(), centroid_offsets[1].size());
-  for (std::size_t i = 0; i < centroid_offsets[0].size(); ++i) EXPECT_NEAR(centroid_offsets[0][i], centroid_offsets[1][i], 1e-6);
+  for (std::size_t i = 0; i < centroid_offsets[0].size(); ++i)
+    EXPECT_NEAR(centroid_offsets[0][i], centroid_offsets[1][i], 1e-6);
 }
 
 TEST(DynamicVoxelGrid, RefusesBadParametersByName) {

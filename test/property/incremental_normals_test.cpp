@@ -1,5 +1,5 @@
-// Contract 2 of the normals: accumulators equal batch sums over the anchors, and normals batch PCA over them, whatever happened and
-// wherever it did.
+// Contract 2 of the normals: accumulators equal batch sums over the anchors, and normals batch PCA over them, whatever
+// happened and wherever it did.
 
 #include "incremental_segmatch/incremental_normals.hpp"
 
@@ -38,7 +38,8 @@ struct Map {
   /// Centre of a voxel's cell, in half units: an integer.
   Vector3l CenterHalfUnits(VoxelHandle voxel) const {
     const double resolution = grid.parameters().resolution_m;
-    const Eigen::Vector3d grid_center(grid.parameters().center_m[0], grid.parameters().center_m[1], grid.parameters().center_m[2]);
+    const Eigen::Vector3d grid_center(grid.parameters().center_m[0], grid.parameters().center_m[1],
+                                      grid.parameters().center_m[2]);
     const std::int64_t half_units_per_cell = std::llround(2.0 * resolution / normals.unit_m());
     const Eigen::Vector3d corner_cells = (grid.BlockCorner(voxel) - grid_center) / resolution;
     const int cell = static_cast<int>(voxel % DynamicVoxelGrid::kCellsPerBlock);
@@ -67,7 +68,9 @@ NormalAccumulators BatchSums(const Map& map, const std::vector<VoxelHandle>& vox
   return sums;
 }
 
-double AngleOf(const Eigen::Vector3d& a, const Eigen::Vector3d& b) { return std::atan2(a.cross(b).norm(), std::abs(a.dot(b))); }
+double AngleOf(const Eigen::Vector3d& a, const Eigen::Vector3d& b) {
+  return std::atan2(a.cross(b).norm(), std::abs(a.dot(b)));
+}
 
 void ExpectBatchPca(const NormalAccumulators& sums, const NormalEstimate& estimate) {
   if (sums.count < 3) {
@@ -119,7 +122,8 @@ TEST(IncrementalNormals, AccumulatorsEqualBatchSumsOverAnchorsAfterAnySequence) 
       } else {
         std::normal_distribution<float> coordinate(0.f, static_cast<float>(scale));
         Points points;
-        for (int i = 0; i < 60; ++i) points.emplace_back(coordinate(random), coordinate(random), 0.5f * coordinate(random));
+        for (int i = 0; i < 60; ++i)
+          points.emplace_back(coordinate(random), coordinate(random), 0.5f * coordinate(random));
         const VoxelUpdate update = map.Insert(points, map.grid.T_odom_grid() * Eigen::Translation3d(center));
         for (const MovedVoxel& moved : update.moved) {
           const Eigen::Vector3d anchor = map.AnchorUnits(moved.voxel).cast<double>() * map.normals.unit_m() + center;
@@ -135,7 +139,8 @@ TEST(IncrementalNormals, AccumulatorsEqualBatchSumsOverAnchorsAfterAnySequence) 
         ASSERT_EQ(found.count, expected.count);
         ASSERT_EQ(found.sum, expected.sum);
         ASSERT_EQ(found.outer, expected.outer);
-        if ((voxel + static_cast<VoxelHandle>(step)) % 3 == 0) ExpectBatchPca(expected, map.normals.Estimate(voxel));  // others stay unread
+        if ((voxel + static_cast<VoxelHandle>(step)) % 3 == 0)
+          ExpectBatchPca(expected, map.normals.Estimate(voxel));  // others stay unread
       }
       if (HasFailure()) return;
     }
@@ -163,7 +168,8 @@ TEST(IncrementalNormals, AccumulatorsDoNotDependOnTheOrderOfScans) {
     traces.push_back(counts);
     std::reverse(scans.begin(), scans.end());
   }
-  // Rounding of running means may put an anchor a unit aside, and so a neighbour on the other side of the radius: rarely.
+  // Rounding of running means may put an anchor a unit aside, and so a neighbour on the other side of the radius:
+  // rarely.
   ASSERT_EQ(traces[0].size(), traces[1].size());
   std::size_t different = 0;
   for (std::size_t i = 0; i < traces[0].size(); ++i) different += traces[0][i] != traces[1][i];
@@ -188,12 +194,14 @@ TEST(IncrementalNormals, TheSameAnywhereInTheWorld) {
   for (const std::vector<float>& far : curvatures) {
     ASSERT_EQ(far.size(), curvatures[0].size());
     std::size_t different = 0;
-    for (std::size_t i = 0; i < far.size(); ++i) different += !(std::abs(far[i] - curvatures[0][i]) < 1e-3f) && !std::isnan(far[i]);
+    for (std::size_t i = 0; i < far.size(); ++i)
+      different += !(std::abs(far[i] - curvatures[0][i]) < 1e-3f) && !std::isnan(far[i]);
     EXPECT_LE(different, far.size() / 100);
   }
 }
 
-/// (3.12) for sums of doubles, straight from the thesis with its normals corrected, N <- R N: what the grid's own frame saves.
+/// (3.12) for sums of doubles, straight from the thesis with its normals corrected, N <- R N: what the grid's own frame
+/// saves.
 TEST(IncrementalNormals, AreThoseOfTransformedAccumulatorsAfterATransform) {
   for (unsigned seed = 0; seed < 200; ++seed) {
     SCOPED_TRACE("seed " + std::to_string(seed));
@@ -201,7 +209,8 @@ TEST(IncrementalNormals, AreThoseOfTransformedAccumulatorsAfterATransform) {
     std::uniform_real_distribution<float> coordinate(-1.f, 1.f);
     Map map(DynamicVoxelGridParameters{}, NormalsParameters{});
     Points points;
-    for (int i = 0; i < 800; ++i) points.emplace_back(coordinate(random), coordinate(random), 0.1f * coordinate(random));
+    for (int i = 0; i < 800; ++i)
+      points.emplace_back(coordinate(random), coordinate(random), 0.1f * coordinate(random));
     map.Insert(points, RandomPose(&random, 5.0));
     const Pose T_before = map.grid.T_odom_grid();
     const Pose T = RandomPose(&random, 50.0);
@@ -211,8 +220,10 @@ TEST(IncrementalNormals, AreThoseOfTransformedAccumulatorsAfterATransform) {
       if (sums.count < 5) continue;
       // A and b about the frame's origin, in metres, before the transform ...
       const double n = static_cast<double>(sums.count), unit = map.normals.unit_m();
-      const Eigen::Vector3d c = map.CenterHalfUnits(voxel).cast<double>() * 0.5 * unit, b0 = sums.sum.cast<double>() * unit;
-      Eigen::Matrix3d A = sums.outer.cast<double>() * unit * unit + b0 * c.transpose() + c * b0.transpose() + n * c * c.transpose();
+      const Eigen::Vector3d c = map.CenterHalfUnits(voxel).cast<double>() * 0.5 * unit,
+                            b0 = sums.sum.cast<double>() * unit;
+      Eigen::Matrix3d A =
+          sums.outer.cast<double>() * unit * unit + b0 * c.transpose() + c * b0.transpose() + n * c * c.transpose();
       Eigen::Vector3d b = b0 + n * c;
       const auto move = [&](const Pose& by) {
         const Eigen::Matrix3d R = by.linear();
@@ -240,7 +251,8 @@ TEST(SmallestEigen, EqualsEigensSolver) {
     // Of any rank and scale, with eigenvalues that may be equal.
     Eigen::Matrix3d factor;
     for (int k = 0; k < 9; ++k) factor.data()[k] = normal(random);
-    Eigen::Vector3d values(std::exp(3.0 * normal(random)), std::exp(3.0 * normal(random)), std::exp(3.0 * normal(random)));
+    Eigen::Vector3d values(std::exp(3.0 * normal(random)), std::exp(3.0 * normal(random)),
+                           std::exp(3.0 * normal(random)));
     if (i % 5 == 0) values[1] = values[0];
     if (i % 7 == 0) values[2] = values[1];
     if (i % 11 == 0) values[i % 3] = 0.0;
@@ -249,7 +261,8 @@ TEST(SmallestEigen, EqualsEigensSolver) {
     Eigen::Matrix3d m = Q * values.asDiagonal() * Q.transpose();
     m = (0.5 * (m + m.transpose())).eval();
     const SmallestEigen found = SmallestEigenOf(m);
-    EXPECT_NEAR(found.value, values.minCoeff(), 1e-4 * values.sum());  // three equal roots lose two thirds of the digits
+    EXPECT_NEAR(found.value, values.minCoeff(),
+                1e-4 * values.sum());  // three equal roots lose two thirds of the digits
     EXPECT_NEAR(found.vector.norm(), 1.0, 1e-9);
     EXPECT_LT((m * found.vector - values.minCoeff() * found.vector).norm(), 3e-4 * values.sum());
   }

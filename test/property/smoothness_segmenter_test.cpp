@@ -1,5 +1,5 @@
-// Smoothness constraints: links satisfy the policy, rough points join without linking, and the partition is that of a slow
-// segmenter that knows nothing but the rules.
+// Smoothness constraints: links satisfy the policy, rough points join without linking, and the partition is that of a
+// slow segmenter that knows nothing but the rules.
 
 #include <gtest/gtest.h>
 
@@ -82,7 +82,9 @@ class Reference {
     while (parents_[member] != member) member = parents_[member];
     return member;
   }
-  bool Near(VoxelHandle a, VoxelHandle b) const { return (grid_->CentroidGrid(a) - grid_->CentroidGrid(b)).norm() <= radius_m_; }
+  bool Near(VoxelHandle a, VoxelHandle b) const {
+    return (grid_->CentroidGrid(a) - grid_->CentroidGrid(b)).norm() <= radius_m_;
+  }
 
   const DynamicVoxelGrid* grid_;
   const SmoothnessPolicy* policy_;
@@ -105,7 +107,8 @@ Points RandomPlanes(std::mt19937* random) {
                                 Eigen::AngleAxisd(1.57 * unit(*random), Eigen::Vector3d::UnitX()));
     const int count = std::uniform_int_distribution<int>(20, 150)(*random);
     for (int i = 0; i < count; ++i)
-      points.push_back((center + frame * Eigen::Vector3d(0.6 * unit(*random), 0.6 * unit(*random), noise(*random))).cast<float>());
+      points.push_back(
+          (center + frame * Eigen::Vector3d(0.6 * unit(*random), 0.6 * unit(*random), noise(*random))).cast<float>());
   }
   return points;
 }
@@ -216,7 +219,8 @@ TEST(SmoothnessPolicy, SeedsAreSortedByRoughness) {
       }
     }
     const auto may_seed = [&](VoxelHandle voxel) { return policy.CanPointBeSeed(voxel); };
-    EXPECT_EQ(static_cast<std::size_t>(std::count_if(update.activated.begin(), update.activated.end(), may_seed)), seeds.size());
+    EXPECT_EQ(static_cast<std::size_t>(std::count_if(update.activated.begin(), update.activated.end(), may_seed)),
+              seeds.size());
   }
 }
 
