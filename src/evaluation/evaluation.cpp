@@ -42,7 +42,8 @@ BackEnd MakeBackEnd(const EvaluationParameters& parameters) {
 
 ClosureRow ToRow(const Closure& closure) {
   return {closure.stamp_query_ns, closure.stamp_target_ns, closure.robot_query, closure.robot_target,
-          closure.T_target_query, closure.inliers,         closure.candidates,  closure.rms_m};
+          closure.T_target_query, closure.inliers,         closure.candidates,  closure.rms_m,
+          closure.covariance};
 }
 
 // Feeds the pose graph and the corrections that come of it; knows when it is time for either.

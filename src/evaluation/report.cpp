@@ -133,6 +133,8 @@ Json ScoreJson(const Score& score) {
       {"places_opposite", score.places_opposite},
       {"translation_error_m", {{"median", score.translation_error_median_m}, {"p95", score.translation_error_95_m}}},
       {"rotation_error_deg", {{"median", score.rotation_error_median_deg}, {"p95", score.rotation_error_95_deg}}},
+      {"normalized_error2",
+       {{"median", score.normalized_error2_median}, {"share_within_95", score.normalized_error2_within_95}}},
       {"gap_m",
        {{"p50", score.gap_50_m},
         {"p90", score.gap_90_m},
@@ -198,6 +200,8 @@ std::string FormatScore(const Score& score) {
           Number(score.rotation_error_median_deg, "%.2f deg") + "; 95 % " +
           Number(score.translation_error_95_m, "%.3f m") + ", " + Number(score.rotation_error_95_deg, "%.2f deg") +
           "\n";
+  text += "covariances         squared errors over them: median " + Number(score.normalized_error2_median, "%.1f") +
+          " (honest: 5.3), " + Number(score.normalized_error2_within_95, "%.3f") + " within 12.6 (honest: 0.95)\n";
   text += "gaps on revisits    50 % " + Number(score.gap_50_m, "%.1f m") + ", 90 % " +
           Number(score.gap_90_m, "%.1f m") + ", 99 % " + Number(score.gap_99_m, "%.1f m") + ", longest " +
           Number(score.gap_max_m, "%.1f m") + "\n";

@@ -1,5 +1,7 @@
 #include "scoring.hpp"
 
+#include <Eigen/Cholesky>
+#include <Eigen/Geometry>
 #include <algorithm>
 #include <cmath>
 #include <fstream>
@@ -114,6 +116,8 @@ bool IsOpposite(const Pose& T_world_a, const Pose& T_world_b) {
   return T_world_a.linear().col(0).dot(T_world_b.linear().col(0)) < 0.0;
 }
 
+constexpr double kChiSquared95OfSix = 12.59;
+
 JudgedClosure Judge(const Truth& drive, const Targets& targets, const ClosureRow& closure,
                     const ScoringParameters& parameters) {
   JudgedClosure judged;
@@ -132,6 +136,12 @@ JudgedClosure Judge(const Truth& drive, const Targets& targets, const ClosureRow
   judged.rotation_error_deg = std::acos(cosine) * kDegreesPerRadian;
   const bool is_true = judged.translation_error_m < parameters.max_translation_m &&
                        judged.rotation_error_deg < parameters.max_rotation_deg;
+  if (closure.covariance) {
+    const Eigen::AngleAxisd turn(error.linear());
+    Eigen::Matrix<double, 6, 1> xi;
+    xi << error.translation(), turn.angle() * turn.axis();
+    judged.normalized_error2 = xi.dot(closure.covariance->ldlt().solve(xi));
+  }
   judged.verdict = is_true ? ClosureVerdict::kTrue : ClosureVerdict::kFalse;
   return judged;
 }
@@ -144,7 +154,7 @@ Score ScoreAgainst(const Truth& truth, const Targets& old, const std::vector<Clo
   score.found.assign(truth.size(), false);
   score.opposite.assign(truth.size(), false);
 
-  std::vector<double> translation_errors, rotation_errors;
+  std::vector<double> translation_errors, rotation_errors, normalized_errors2;
   for (const ClosureRow& closure : closures) {
     const JudgedClosure judged = Judge(truth, old, closure, parameters);
     score.judged.push_back(judged);
@@ -156,6 +166,7 @@ Score ScoreAgainst(const Truth& truth, const Targets& old, const std::vector<Clo
     score.found[judged.query_step] = true;
     translation_errors.push_back(judged.translation_error_m);
     rotation_errors.push_back(judged.rotation_error_deg);
+    if (judged.normalized_error2) normalized_errors2.push_back(*judged.normalized_error2);
   }
   score.closures = score.true_closures + score.false_closures;
   score.precision = Ratio(score.true_closures, score.closures);
@@ -193,6 +204,8 @@ Score ScoreAgainst(const Truth& truth, const Targets& old, const std::vector<Clo
   score.translation_error_95_m = Percentile(translation_errors, 0.95);
   score.rotation_error_median_deg = Percentile(rotation_errors, 0.5);
   score.rotation_error_95_deg = Percentile(rotation_errors, 0.95);
+  score.normalized_error2_median = Percentile(normalized_errors2, 0.5);
+  score.normalized_error2_within_95 = ShareWithin(normalized_errors2, kChiSquared95OfSix);
   score.gap_50_m = Percentile(gaps, 0.5);
   score.gap_90_m = Percentile(gaps, 0.9);
   score.gap_99_m = Percentile(gaps, 0.99);

@@ -21,6 +21,7 @@ struct ClosureRow {
   std::size_t inliers = 0;
   std::size_t candidates = 0;
   double rms_m = 0.0;
+  std::optional<Covariance6> covariance;  ///< of T_target_query, as in Closure; not in closures.csv
 };
 
 /// Writes closures.csv: stamps in seconds with nine decimals. Throws std::runtime_error naming the file.
@@ -58,6 +59,9 @@ struct JudgedClosure {
   std::size_t target_step = 0;  ///< valid unless unmatched
   double translation_error_m = 0.0;
   double rotation_error_deg = 0.0;
+  /// Squared error in units of the stated covariance, e^T C^-1 e, e of six dimensions: chi squared, 6 in the mean, where
+  /// the covariance is honest. None without a covariance.
+  std::optional<double> normalized_error2;
 };
 
 /// Score of a drive. Ratios and percentiles over nothing are NaN.
@@ -74,10 +78,12 @@ struct Score {
   double recall = 0.0;  ///< share of revisits with a true closure
   double recall_same_direction = 0.0;
   double recall_opposite_direction = 0.0;
-  double translation_error_median_m = 0.0;  ///< over true closures, like the next three
+  double translation_error_median_m = 0.0;  ///< over true closures, like the next five
   double translation_error_95_m = 0.0;
   double rotation_error_median_deg = 0.0;
   double rotation_error_95_deg = 0.0;
+  double normalized_error2_median = 0.0;  ///< 5.35 where the stated covariances are honest, less where they are modest
+  double normalized_error2_within_95 = 0.0;  ///< share of true closures within 12.59: 0.95 where they are honest
   double gap_50_m =
       0.0;  ///< metres of revisited path between consecutive true closures, both ends of each stretch included
   double gap_90_m = 0.0;

@@ -342,6 +342,44 @@ TEST(Scoring, PlacesAreStretchesWithATrueClosure) {
   EXPECT_EQ(score.true_closures, 1u);
 }
 
+// Errors drawn from a covariance that is stated truly, and from the same one stated too small.
+TEST(Scoring, TellsHonestCovariancesFromOptimisticOnes) {
+  Drive drive;
+  for (int i = 0; i < 2000; ++i) {
+    drive.stamps_ns.push_back(i * kPeriodNs);
+    drive.T_world_sensor.push_back(PlanarPose(0.2 * (i % 1000), 0, 0));
+  }
+  std::mt19937 random(1);
+  std::normal_distribution<double> normal;
+  Covariance6 factor = Covariance6::Zero();
+  for (int row = 0; row < 6; ++row)
+    for (int column = 0; column <= row; ++column) factor(row, column) = (row < 3 ? 0.02 : 0.001) * normal(random);
+  const Covariance6 covariance = factor * factor.transpose();
+  std::vector<ClosureRow> closures;
+  for (int i = 0; i < 4000; ++i) {
+    Eigen::Matrix<double, 6, 1> xi;
+    for (int k = 0; k < 6; ++k) xi[k] = normal(random);
+    xi = factor * xi;
+    Pose error = Pose::Identity();
+    error.translation() = xi.head<3>();
+    error.linear() = Eigen::AngleAxisd(xi.tail<3>().norm(), xi.tail<3>().normalized()).toRotationMatrix();
+    ClosureRow row;
+    row.stamp_query_ns = drive.stamps_ns[1000 + i % 1000];
+    row.stamp_target_ns = drive.stamps_ns[i % 1000];
+    row.T_target_query = error;
+    row.covariance = covariance;
+    closures.push_back(row);
+  }
+  Score score = ScoreClosures(drive, closures, {});
+  ASSERT_EQ(score.true_closures, closures.size());
+  EXPECT_NEAR(score.normalized_error2_median, 5.35, 0.3);
+  EXPECT_NEAR(score.normalized_error2_within_95, 0.95, 0.02);
+  for (ClosureRow& row : closures) row.covariance = 0.25 * covariance;
+  EXPECT_LT(ScoreClosures(drive, closures, {}).normalized_error2_within_95, 0.5);
+  for (ClosureRow& row : closures) row.covariance.reset();
+  EXPECT_TRUE(std::isnan(ScoreClosures(drive, closures, {}).normalized_error2_median));
+}
+
 TEST(TrajectoryError, IsTheResidualAfterAlignment) {
   std::mt19937 random(5);
   std::uniform_real_distribution<double> uniform(-50.0, 50.0);
