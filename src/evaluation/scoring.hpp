@@ -21,7 +21,7 @@ struct ClosureRow {
   std::size_t inliers = 0;
   std::size_t candidates = 0;
   double rms_m = 0.0;
-  std::optional<Covariance6> covariance;  ///< of T_target_query, as in Closure; not in closures.csv
+  std::optional<Covariance6> covariance = std::nullopt;  ///< of T_target_query, as in Closure; not in closures.csv
 };
 
 /// Writes closures.csv: stamps in seconds with nine decimals. Throws std::runtime_error naming the file.
