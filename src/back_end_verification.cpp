@@ -1,0 +1,346 @@
+// Whether a robot is where its segments were recognised: laid on scans, held against the map and the way there.
+// The rest of BackEnd is in back_end.cpp.
+
+#include <Eigen/Eigenvalues>
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <stdexcept>
+#include <utility>
+
+#include "incremental_segmatch/back_end.hpp"
+#include "incremental_segmatch/twist.hpp"
+
+namespace incremental_segmatch {
+namespace {
+
+StepEnd ToStepEnd(Verdict verdict) {
+  switch (verdict) {
+    case Verdict::kAccepted: return StepEnd::kRecognized;
+    case Verdict::kAmbiguous: return StepEnd::kAmbiguous;
+    case Verdict::kUncovered: return StepEnd::kUncovered;
+    case Verdict::kContradicted: return StepEnd::kContradicted;
+    case Verdict::kUncertain: return StepEnd::kUncertain;
+    case Verdict::kTooFar: return StepEnd::kTooFar;
+  }
+  return StepEnd::kUncertain;
+}
+
+std::vector<Eigen::Vector3d> ToDoubles(const Points& points) {
+  std::vector<Eigen::Vector3d> doubles;
+  doubles.reserve(points.size());
+  for (const Eigen::Vector3f& p : points) doubles.push_back(p.cast<double>());
+  return doubles;
+}
+
+double LargestSigma(const Eigen::Matrix3d& covariance) {
+  return std::sqrt(std::max(0.0, Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d>(covariance, Eigen::EigenvaluesOnly).eigenvalues()[2]));
+}
+
+}  // namespace
+
+const SegmentView& BackEnd::MatchedView(RobotIndex robot, const Correspondence& inlier) const {
+  for (const TargetCandidate& candidate : robots_[robot].local.at(inlier.local.id).candidates)
+    if (candidate.segment == inlier.target) return map_.Find(inlier.target)->views[index_.view(candidate.item).view];
+  throw std::logic_error("an inlier is none of the candidates");
+}
+
+/// Lays a recognition on scans, and where there is a rival, the rival as well: what fits better is the recognition. Gathers the
+/// evidence for it and judges that. `counts` gets the evidence and the end, which says whether what comes back is accepted.
+std::optional<Closure> BackEnd::Verify(RobotIndex robot, const RecognizerResult& result, BackEndCounts* counts) {
+  std::optional<Hypothesis> best = LayOnScans(robot, *result.recognition, &counts->end);
+  if (result.runner_up && (!best || HasRival(best->closure.evidence, parameters_.acceptance))) {
+    StepEnd end;
+    std::optional<Hypothesis> rival = LayOnScans(robot, *result.runner_up, &end);
+    if (rival && (!best || Distinction(*rival, *best) > 0.5)) std::swap(best, rival);
+    if (best) best->closure.evidence.distinction = rival ? Distinction(*best, *rival) : 1.0;
+  }
+  if (!best) return std::nullopt;
+
+  robots_[robot].target = best->target;
+  Closure& closure = best->closure;
+  Evidence& evidence = closure.evidence;
+  MeasureCoverage(robot, closure.T_map_odom, &evidence);
+  MeasureContradiction(robot, best->target, closure, &evidence);
+  evidence.distance_m = closure.T_target_query.translation().norm();
+  evidence.sigma_m = LargestSigma(closure.covariance.topLeftCorner<3, 3>());
+  evidence.sigma_rad = LargestSigma(closure.covariance.bottomRightCorner<3, 3>());
+  const bool is_deceptive = IsDeceptive(evidence, parameters_.acceptance);
+  if (is_deceptive && !best->fits.empty())
+    FollowTrack(robot, *best, evidence.overlap / ExpectedOverlap(best->target), &evidence);
+  const Verdict verdict = Judge(evidence, parameters_.acceptance);
+  // What is accepted without twins can be relied on.
+  if (!is_deceptive && verdict == Verdict::kAccepted) FollowTrack(robot, *best, 1.0, &evidence);
+  counts->evidence = evidence;
+  counts->end = ToStepEnd(verdict);
+  closure.candidates = result.candidates;
+  return std::move(closure);
+}
+
+/// A recognition as a closure to the key frame there, refined on scans. Nothing, and why, if that can't be.
+std::optional<BackEnd::Hypothesis> BackEnd::LayOnScans(RobotIndex robot, const Recognition& recognition, StepEnd* end) {
+  const std::optional<KeyframeName> target = NearestKeyframe(robot, recognition);
+  if (!target) {
+    *end = StepEnd::kTooYoung;
+    return std::nullopt;
+  }
+  Hypothesis hypothesis{*target, MakeClosure(robot, robots_[robot].stamp_ns, recognition, *target), {}};
+  Evidence& evidence = hypothesis.closure.evidence;
+  evidence.inliers = recognition.inliers.size();
+  evidence.runner_up = recognition.runner_up_size;
+  evidence.since_twin_m = robots_[robot].path_m - robots_[robot].twin_path_m;
+  const bool is_near = hypothesis.closure.T_target_query.translation().norm() <= parameters_.acceptance.max_distance_m;
+  if (parameters_.refinement.enabled && is_near && !Refine(robot, &hypothesis)) {
+    *end = StepEnd::kNotRefined;
+    return std::nullopt;
+  }
+  return hypothesis;
+}
+
+/// Of the scan's points that lie on something at only one of two places the share that does so at the first. One half where
+/// nothing tells the places apart, or one of them was not laid on scans.
+double BackEnd::Distinction(const Hypothesis& first, const Hypothesis& second) {
+  std::size_t only_first = 0, only_second = 0;
+  for (std::size_t i = 0; i < std::min(first.fits.size(), second.fits.size()); ++i) {
+    only_first += first.fits[i] && !second.fits[i];
+    only_second += second.fits[i] && !first.fits[i];
+  }
+  const std::size_t all = only_first + only_second;
+  return all == 0 ? 0.5 : static_cast<double>(only_first) / static_cast<double>(all);
+}
+
+/// Recognitions that agree by odometry make a track. Adds a hypothesis to the one that it continues, and says how long that is,
+/// and how well the scans have fitted along it.
+void BackEnd::FollowTrack(RobotIndex index, const Hypothesis& hypothesis, double fit, Evidence* evidence) {
+  Robot& robot = robots_[index];
+  const auto position = [&](const KeyframeName& target, const Pose& T_target_sensor) {
+    return Eigen::Vector3d((PoseOf(target).T_map_sensor * T_target_sensor).translation());
+  };
+  const auto is_over = [&](const Track& track) {
+    return robot.path_m - track.fits.back().path_m > parameters_.history.spacing_m;
+  };
+  robot.tracks.erase(std::remove_if(robot.tracks.begin(), robot.tracks.end(), is_over), robot.tracks.end());
+  const Eigen::Vector3d place = position(hypothesis.target, hypothesis.closure.T_target_query);
+  const auto continues = [&](const Track& track) {
+    const Pose T_target_now = track.T_target_query * track.T_odom_sensor.inverse() * robot.T_odom_sensor;
+    return (position(track.target, T_target_now) - place).norm() <= parameters_.recognizer.same_place_m;
+  };
+  auto track = std::find_if(robot.tracks.begin(), robot.tracks.end(), continues);
+  if (track == robot.tracks.end()) track = robot.tracks.insert(track, Track{});
+  track->target = hypothesis.target;
+  track->T_target_query = hypothesis.closure.T_target_query;
+  track->T_odom_sensor = robot.T_odom_sensor;
+  track->fits.push_back({robot.path_m, std::min(1.0, fit)});
+  // As long as need be, and no longer.
+  while (track->fits.size() > 1 && robot.path_m - track->fits[1].path_m >= parameters_.acceptance.min_track_m)
+    track->fits.pop_front();
+  evidence->track_m = robot.path_m - track->fits.front().path_m;
+  for (const Fit& link : track->fits) evidence->track_fit += link.value / static_cast<double>(track->fits.size());
+}
+
+/// How much of a key frame's scan lies on those of its neighbours along the trajectory: what can be expected of a scan that is
+/// laid on them.
+double BackEnd::ExpectedOverlap(const KeyframeName& keyframe) {
+  Submap& submap = SubmapAround(keyframe);
+  if (submap.expected_overlap == 0.0) {
+    const std::shared_ptr<const Points>& scan = map_.Keyframes(submap.center.robot)[submap.center.index].scan_sensor;
+    const RefinementTarget others(JoinScans(submap.center, false), parameters_.refinement);
+    if (scan) submap.expected_overlap = others.Overlap(ToDoubles(*scan), Pose::Identity());
+    if (!(submap.expected_overlap > 0.0)) submap.expected_overlap = 1.0;  // a scan that is alone
+  }
+  return submap.expected_overlap;
+}
+
+/// Holds all local segments, not the inliers alone, against the map around the recognised place.
+void BackEnd::MeasureCoverage(RobotIndex robot, const Pose& T_map_odom, Evidence* evidence) const {
+  std::vector<Eigen::Vector3d> local;
+  double reach_m = 0.0;
+  const Eigen::Vector3d place = T_map_odom * robots_[robot].T_odom_sensor.translation();
+  for (const auto& [id, segment] : robots_[robot].local) {
+    local.push_back(T_map_odom * segment.centroid_odom);
+    reach_m = std::max(reach_m, (local.back() - place).norm());
+  }
+  reach_m += parameters_.acceptance.neighbourhood_m;
+  std::vector<Eigen::Vector3d> target;
+  for (std::uint64_t item = 0; item < index_.next_item(); ++item)
+    if (index_.IsOpen(item, robot) && (index_.view(item).centroid_map - place).squaredNorm() <= reach_m * reach_m)
+      target.push_back(index_.view(item).centroid_map);
+  incremental_segmatch::MeasureCoverage(local, target, parameters_.acceptance, evidence);
+}
+
+const TrajectoryPose& BackEnd::PoseOf(const KeyframeName& keyframe) const {
+  return map_.Trajectory(keyframe.robot)[map_.Keyframes(keyframe.robot)[keyframe.index].pose];
+}
+
+/// Of the key frames along the passes on which the matched segments were seen, kept or recognised there, the one nearest to the
+/// recognised place: other passes may lie where they don't belong, until a correction. None if all of them are too young.
+std::optional<BackEnd::KeyframeName> BackEnd::NearestKeyframe(RobotIndex robot, const Recognition& recognition) const {
+  std::map<RobotIndex, std::vector<double>> seen_from_m;  // path of the poses, by robot
+  for (const Correspondence& inlier : recognition.inliers) {
+    const SegmentView& view = MatchedView(robot, inlier);
+    seen_from_m[view.robot].push_back(map_.PoseOf(view).path_m);
+  }
+  const Eigen::Vector3d place = recognition.T_target_local * robots_[robot].T_odom_sensor.translation();
+  std::optional<KeyframeName> nearest;
+  double nearest2 = std::numeric_limits<double>::infinity();
+  for (auto& [other, paths_m] : seen_from_m) {
+    std::sort(paths_m.begin(), paths_m.end());
+    const auto consider = [&, &paths_m = paths_m](const KeyframeName& keyframe, double path_m) {
+      const double distance2 = (PoseOf(keyframe).T_map_sensor.translation() - place).squaredNorm();
+      if (distance2 >= nearest2) return;
+      const auto next = std::lower_bound(paths_m.begin(), paths_m.end(), path_m - parameters_.keyframes.reach_m);
+      if (next == paths_m.end() || *next > path_m + parameters_.keyframes.reach_m) return;
+      if (keyframe.robot == robot && IsYoung(robot, map_.Keyframes(robot)[keyframe.index].pose)) return;
+      nearest2 = distance2;
+      nearest = keyframe;
+    };
+    for (std::size_t i = 0; i < map_.Keyframes(other).size(); ++i) consider({other, i}, PoseOf({other, i}).path_m);
+    for (const Sighting& sighting : robots_[other].sightings) consider(sighting.keyframe, sighting.path_m);
+  }
+  return nearest;
+}
+
+/// Of the key frames of one pass, within so much of path around one of them, the nearest to a place, if it is near enough.
+std::optional<BackEnd::KeyframeName> BackEnd::NearestKeyframeAlong(const KeyframeName& around, double along_m,
+                                                                   const Eigen::Vector3d& place) const {
+  const double path_m = PoseOf(around).path_m;
+  std::optional<KeyframeName> nearest;
+  double nearest2 = parameters_.history.max_distance_m * parameters_.history.max_distance_m;
+  const auto consider = [&](std::size_t index) {
+    const TrajectoryPose& pose = PoseOf({around.robot, index});
+    if (std::abs(pose.path_m - path_m) > along_m) return false;
+    const double distance2 = (pose.T_map_sensor.translation() - place).squaredNorm();
+    if (distance2 < nearest2) {
+      nearest2 = distance2;
+      nearest = KeyframeName{around.robot, index};
+    }
+    return true;
+  };
+  for (std::size_t i = around.index; i < map_.Keyframes(around.robot).size() && consider(i); ++i) {
+  }
+  for (std::size_t i = around.index; i > 0 && consider(i - 1); --i) {
+  }
+  return nearest;
+}
+
+/// Holds the key frames around the place, and along the way to it, against what the robot's scans saw there.
+void BackEnd::MeasureContradiction(RobotIndex index, const KeyframeName& target, const Closure& closure,
+                                   Evidence* evidence) const {
+  constexpr std::size_t kMinJudged = 50;  // points, for a share to mean something
+  const Robot& robot = robots_[index];
+  const Points* scan_target = map_.Keyframes(target.robot)[target.index].scan_sensor.get();
+  if (!robot.scan_sensor || scan_target == nullptr) return;
+  FreeSpaceCounts all;
+  const auto compare = [&](const RangeImage& image, const Points& points, const Pose& T_image_points, double slack_m) {
+    const FreeSpaceCounts counts = image.Compare(points, T_image_points, slack_m, parameters_.free_space);
+    all += counts;
+    if (counts.confirmed + counts.seen_through >= kMinJudged)
+      evidence->contradiction_once = std::max(evidence->contradiction_once, counts.Contradiction());
+  };
+  compare(RangeImage(*robot.scan_sensor), *scan_target, closure.T_target_query.inverse(), 0.0);
+  for (const PastScan& past : robot.history) {
+    const double back_m = robot.path_m - past.path_m;
+    const Pose T_map_past = closure.T_map_odom * past.T_odom_sensor;
+    const std::optional<KeyframeName> there =
+        NearestKeyframeAlong(target, back_m + parameters_.keyframes.reach_m, T_map_past.translation());
+    if (!there) continue;
+    // The same pass again would only tell its own drift.
+    if (there->robot == index && past.path_m - PoseOf(*there).path_m <= parameters_.matching.min_path_m) continue;
+    const Points* scan_there = map_.Keyframes(there->robot)[there->index].scan_sensor.get();
+    if (scan_there == nullptr) continue;
+    // Both visits have drifted on the way between there and here.
+    compare(past.image, *scan_there, T_map_past.inverse() * PoseOf(*there).T_map_sensor,
+            2.0 * parameters_.history.drift * back_m);
+  }
+  evidence->contradiction = all.confirmed + all.seen_through >= kMinJudged ? all.Contradiction() : 0.0;
+}
+
+/// Keeps this step's scan for the history if the robot went far enough, and forgets what is too far back.
+void BackEnd::KeepHistory(RobotIndex index) {
+  Robot& robot = robots_[index];
+  while (!robot.history.empty() && robot.path_m - robot.history.front().path_m > parameters_.history.length_m)
+    robot.history.pop_front();
+  if (!robot.scan_sensor) return;
+  if (!robot.history.empty() && robot.path_m - robot.history.back().path_m < parameters_.history.spacing_m) return;
+  robot.history.push_back({robot.T_odom_sensor, robot.path_m, RangeImage(*robot.scan_sensor)});
+}
+
+/// The scan that made the recognition is laid on those around the key frame: neither has drifted, as the local map and the
+/// segments that were gathered along the way have. False if it doesn't fit.
+bool BackEnd::Refine(RobotIndex index, Hypothesis* hypothesis) {
+  const Robot& robot = robots_[index];
+  const KeyframeName& target = hypothesis->target;
+  Closure* const closure = &hypothesis->closure;
+  if (!robot.scan_sensor) return false;
+  Submap& submap = SubmapAround(target);
+  const Pose T_center_target = PoseOf(submap.center).T_odom_sensor.inverse() * PoseOf(target).T_odom_sensor;
+  const std::optional<RefinedTransform> refined =
+      submap.target.Refine(ToDoubles(*robot.scan_sensor), T_center_target * closure->T_target_query);
+  if (!refined) return false;
+  const Pose T_target_query = T_center_target.inverse() * refined->T_target_local;
+  closure->T_map_odom = closure->T_map_odom * robot.T_odom_sensor * closure->T_target_query.inverse() * T_target_query *
+                        robot.T_odom_sensor.inverse();
+  closure->T_target_query = T_target_query;
+  closure->covariance = MoveToTheRight(refined->covariance, refined->T_target_local);
+  closure->evidence.overlap = refined->overlap;
+  hypothesis->fits = refined->has_partner;
+  return true;
+}
+
+/// Of the last submaps one whose center is near, or a new one around the key frame.
+BackEnd::Submap& BackEnd::SubmapAround(const KeyframeName& keyframe) {
+  constexpr std::size_t kKept = 4;  // passes of one street take turns, and rivals
+  const auto is_near = [&](const Submap& submap) {
+    return submap.center.robot == keyframe.robot &&
+           std::abs(PoseOf(submap.center).path_m - PoseOf(keyframe).path_m) <= 0.5 * parameters_.keyframes.submap_radius_m;
+  };
+  const auto found = std::find_if(submaps_.begin(), submaps_.end(), is_near);
+  if (found != submaps_.end()) {
+    std::rotate(submaps_.begin(), found, found + 1);
+  } else {
+    submaps_.push_front({keyframe, RefinementTarget(JoinScans(keyframe, true), parameters_.refinement)});
+    if (submaps_.size() > kKept) submaps_.pop_back();
+  }
+  return submaps_.front();
+}
+
+/// Scans of a key frame, or not, and of its neighbours along the trajectory, in its sensor's frame. Odometry joins them.
+std::vector<Eigen::Vector3d> BackEnd::JoinScans(const KeyframeName& center, bool with_center) const {
+  const std::vector<Keyframe>& keyframes = map_.Keyframes(center.robot);
+  const Pose T_center_odom = PoseOf(center).T_odom_sensor.inverse();
+  std::vector<Eigen::Vector3d> points;
+  const auto add = [&](std::size_t index) {
+    const Pose T_center_sensor = T_center_odom * PoseOf({center.robot, index}).T_odom_sensor;
+    if (T_center_sensor.translation().norm() > parameters_.keyframes.submap_radius_m) return false;
+    if (keyframes[index].scan_sensor && (with_center || index != center.index))
+      for (const Eigen::Vector3f& p : *keyframes[index].scan_sensor) points.push_back(T_center_sensor * p.cast<double>());
+    return true;
+  };
+  for (std::size_t i = center.index; i < keyframes.size() && add(i); ++i) {
+  }
+  for (std::size_t i = center.index; i > 0 && add(i - 1); --i) {
+  }
+  return points;
+}
+
+/// The closure between the query's sensor and a key frame's, as the segments' centroids have it.
+Closure BackEnd::MakeClosure(RobotIndex robot, StampNs stamp_ns, const Recognition& recognition,
+                             const KeyframeName& keyframe) const {
+  const TrajectoryPose& target = PoseOf(keyframe);
+  const Pose T_map_query = recognition.T_target_local * robots_[robot].T_odom_sensor;
+  Closure closure;
+  closure.stamp_query_ns = stamp_ns;
+  closure.stamp_target_ns = target.stamp_ns;
+  closure.robot_query = robots_[robot].name;
+  closure.robot_target = map_.RobotName(keyframe.robot);
+  closure.T_target_query = target.T_map_sensor.inverse() * T_map_query;
+  closure.covariance = MoveToTheRight(recognition.covariance, T_map_query);
+  closure.inliers = recognition.inliers.size();
+  closure.rms_m = recognition.rms_m;
+  closure.T_map_odom = recognition.T_target_local;
+  for (const Correspondence& c : recognition.inliers)
+    closure.matches.push_back({c.local, c.target, c.centroid_local, c.centroid_target, c.descriptor_distance});
+  return closure;
+}
+
+}  // namespace incremental_segmatch
