@@ -6,7 +6,6 @@
 #include <stdexcept>
 #include <utility>
 
-#include "incremental_segmatch/twist.hpp"
 
 namespace incremental_segmatch {
 namespace {
