@@ -143,7 +143,9 @@ def rviz(source, folder):
         wait_until(lambda: not missing(), lambda: "rviz subscribes %s; it says:\n%s" % (
             ", ".join(sorted(missing())), (folder / "rviz.txt").read_text()))
     said = (folder / "rviz.txt").read_text()
-    if "ERROR" in said or "could not be loaded" in said:
+    # A busy master is asked once more by roscpp itself; that all topics are subscribed was seen above.
+    errors = [line for line in said.splitlines() if "ERROR" in line and "Retrying..." not in line]
+    if errors or "could not be loaded" in said:
         sys.exit("rviz says:\n" + said)
     print("%d displays have publishers of their types; rviz subscribes the %d that are on" % (len(displays), len(wanted)))
 
