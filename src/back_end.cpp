@@ -6,7 +6,6 @@
 #include <stdexcept>
 #include <utility>
 
-
 namespace incremental_segmatch {
 namespace {
 
@@ -163,20 +162,16 @@ BackEndStep BackEnd::AttemptRecognition(RobotIndex robot, StageTimer timer) {
   timer.Lap("recognition");
 
   step.counts.end = ToStepEnd(result.outcome);
-  if (result.recognition) {
-    std::optional<Closure> judged = Verify(robot, result, &step.counts);
-    if (judged && HasRival(judged->evidence, parameters_.acceptance) &&
-        judged->evidence.runner_up >= parameters_.acceptance.twin_size) {
-      robots_[robot].twin_path_m = robots_[robot].path_m;
-    }
-    if (step.counts.end == StepEnd::kRecognized) {
-      step.closure = std::move(judged);
-      AcceptClosure(robot, *step.closure);
-    } else {
-      step.refused = std::move(judged);
-    }
+  std::optional<Hypothesis> judged;
+  if (result.recognition) judged = Verify(robot, result, &step.counts);
+  const bool is_recognized = step.counts.end == StepEnd::kRecognized;
+  if (judged && HasRival(judged->closure.evidence, parameters_.acceptance) &&
+      judged->closure.evidence.runner_up >= parameters_.acceptance.twin_size) {
+    robots_[robot].twin_path_m = robots_[robot].path_m;
   }
-  if (IsLoopClosure()) KeepKeyframe(robot, step.closure);
+  if (is_recognized) AcceptClosure(robot, judged->closure);
+  if (IsLoopClosure()) KeepKeyframe(robot, is_recognized ? &*judged : nullptr);
+  if (judged) (is_recognized ? step.closure : step.refused) = std::move(judged->closure);
   KeepHistory(robot);
   timer.Lap("refinement");
 
@@ -493,13 +488,14 @@ bool BackEnd::IsYoung(RobotIndex robot, std::uint32_t pose) const {
          robots_[robot].path_m - map_.Trajectory(robot)[pose].path_m <= parameters_.matching.min_path_m;
 }
 
-/// Keeps this step's scan if the robot went far enough since the last key frame, or remembers that there is one already.
-void BackEnd::KeepKeyframe(RobotIndex index, const std::optional<Closure>& closure) {
+/// Keeps this step's scan if the robot went far enough since the last key frame, or remembers that there is one already,
+/// where it was recognised (otherwise null).
+void BackEnd::KeepKeyframe(RobotIndex index, const Hypothesis* recognized) {
   Robot& robot = robots_[index];
   const double spacing_m = parameters_.keyframes.spacing_m;
   if (robot.path_m - robot.keyframe_path_m < spacing_m) return;
-  if (closure && closure->T_target_query.translation().norm() < spacing_m) {
-    robot.sightings.push_back({robot.path_m, robot.target});
+  if (recognized != nullptr && recognized->closure.T_target_query.translation().norm() < spacing_m) {
+    robot.sightings.push_back({robot.path_m, recognized->target});
   } else {
     map_.AddKeyframe(index, robot.scan_sensor);
   }

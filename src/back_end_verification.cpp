@@ -47,7 +47,8 @@ const SegmentView& BackEnd::MatchedView(RobotIndex robot, const Correspondence& 
 
 /// Lays a recognition on scans, and where there is a rival, the rival as well: what fits better is the recognition. Gathers the
 /// evidence for it and judges that. `counts` gets the evidence and the end, which says whether what comes back is accepted.
-std::optional<Closure> BackEnd::Verify(RobotIndex robot, const RecognizerResult& result, BackEndCounts* counts) {
+std::optional<BackEnd::Hypothesis> BackEnd::Verify(RobotIndex robot, const RecognizerResult& result,
+                                                   BackEndCounts* counts) {
   std::optional<Hypothesis> best = LayOnScans(robot, *result.recognition, &counts->end);
   if (result.runner_up && (!best || HasRival(best->closure.evidence, parameters_.acceptance))) {
     StepEnd end;
@@ -57,7 +58,6 @@ std::optional<Closure> BackEnd::Verify(RobotIndex robot, const RecognizerResult&
   }
   if (!best) return std::nullopt;
 
-  robots_[robot].target = best->target;
   Closure& closure = best->closure;
   Evidence& evidence = closure.evidence;
   MeasureCoverage(robot, closure.T_map_odom, &evidence);
@@ -74,7 +74,7 @@ std::optional<Closure> BackEnd::Verify(RobotIndex robot, const RecognizerResult&
   counts->evidence = evidence;
   counts->end = ToStepEnd(verdict);
   closure.candidates = result.candidates;
-  return std::move(closure);
+  return best;
 }
 
 /// A recognition as a closure to the key frame there, refined on scans. Nothing, and why, if that can't be.

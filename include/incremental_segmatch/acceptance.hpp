@@ -38,7 +38,7 @@ struct Evidence {
   std::size_t runner_up = 0;  ///< size of the best clique that speaks for another place
   double since_twin_m = std::numeric_limits<double>::infinity();  ///< path since a place had a twin
   double distinction = 0.0;  ///< of the scan's points that fit only one of this and the rival's place: share that fits this
-  double track_m = 0.0;      ///< path over which recognitions agree by odometry; known where there are twins or a rival
+  double track_m = 0.0;      ///< path over which recognitions agree by odometry; where there are twins, a rival, or acceptance
   double track_fit = 0.0;    ///< mean overlap over that path, over the overlap that the map's scans have with each other
   std::size_t expected = 0;   ///< local segments where the map was seen
   std::size_t supported = 0;  ///< of them, those with a target segment in their place

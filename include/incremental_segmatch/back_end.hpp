@@ -235,7 +235,6 @@ class BackEnd {
     double path_m = 0.0;
     double twin_path_m = -std::numeric_limits<double>::infinity();      // where a place last had a twin
     double keyframe_path_m = -std::numeric_limits<double>::infinity();  // where the last key frame was kept or sighted
-    KeyframeName target;              // of the last recognition that was judged
     std::vector<Sighting> sightings;  // of key frames
     Pose T_odom_sensor = Pose::Identity();      // odom without its jumps, here and in all else that is kept
     Pose T_odom_continuous = Pose::Identity();  // and the jumps
@@ -268,7 +267,7 @@ class BackEnd {
   bool NeedsQuery(RobotIndex robot, const LocalSegment& segment) const;
   std::map<RobotIndex, Correspondences> CollectCorrespondences(RobotIndex robot) const;
   RecognizerResult Recognize(RobotIndex robot, const std::map<RobotIndex, Correspondences>& by_frame);
-  std::optional<Closure> Verify(RobotIndex robot, const RecognizerResult& result, BackEndCounts* counts);
+  std::optional<Hypothesis> Verify(RobotIndex robot, const RecognizerResult& result, BackEndCounts* counts);
   std::optional<Hypothesis> LayOnScans(RobotIndex robot, const Recognition& recognition, StepEnd* end);
   static double Distinction(const Hypothesis& first, const Hypothesis& second);
   void FollowTrack(RobotIndex robot, const Hypothesis& hypothesis, double fit, Evidence* evidence);
@@ -285,7 +284,7 @@ class BackEnd {
   std::vector<Eigen::Vector3d> JoinScans(const KeyframeName& center, bool with_center) const;
   void MeasureCoverage(RobotIndex robot, const Pose& T_map_odom, Evidence* evidence) const;
   Closure MakeClosure(RobotIndex robot, StampNs stamp_ns, const Recognition& recognition, const KeyframeName& keyframe) const;
-  void KeepKeyframe(RobotIndex robot, const std::optional<Closure>& closure);
+  void KeepKeyframe(RobotIndex robot, const Hypothesis* recognized);
   void AcceptClosure(RobotIndex robot, const Closure& closure);
   void JoinFrames(RobotIndex robot, RobotIndex target_robot, const Pose& T_map_odom);
 

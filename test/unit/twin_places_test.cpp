@@ -130,14 +130,19 @@ class Robot {
   double time_s_ = 0.0;
 };
 
+/// A pass along the first two blocks, and what comes of another one from here to there.
+std::vector<Robot::Step> DriveAgain(const Street& street, double from_m, double to_m) {
+  Robot robot(street);
+  robot.Drive(0.0, 2 * kBlock_m);
+  return robot.Drive(from_m, to_m);
+}
+
 TEST(TwinPlaces, AreToldApartByScansAfterSomeWay) {
   for (unsigned seed = 1; seed <= 5; ++seed) {
     SCOPED_TRACE("seed " + std::to_string(seed));
     const Street street(2, true, seed);
-    Robot robot(street);
-    robot.Drive(0.0, 2 * kBlock_m);
     int rivals = 0, accepted = 0;
-    for (const Robot::Step& step : robot.Drive(0.0, 2 * kBlock_m)) {
+    for (const Robot::Step& step : DriveAgain(street, 0.0, 2 * kBlock_m)) {
       SCOPED_TRACE("at " + std::to_string(step.x) + " m: " + ToString(step.result.counts.end));
       rivals += step.has_rival;
       if (!step.result.closure) continue;
@@ -157,10 +162,8 @@ TEST(TwinPlaces, ThatAreCopiesInAllAreNotAccepted) {
   for (unsigned seed = 1; seed <= 5; ++seed) {
     SCOPED_TRACE("seed " + std::to_string(seed));
     const Street street(2, false, seed);
-    Robot robot(street);
-    robot.Drive(0.0, 2 * kBlock_m);
     int refused = 0;
-    for (const Robot::Step& step : robot.Drive(0.0, 2 * kBlock_m)) {
+    for (const Robot::Step& step : DriveAgain(street, 0.0, 2 * kBlock_m)) {
       SCOPED_TRACE("at " + std::to_string(step.x) + " m: " + ToString(step.result.counts.end));
       // In the middle of a block no scan sees where the row of copies begins or ends.
       if (step.has_rival && std::abs(step.x - 1.5 * kBlock_m) <= 0.5 * kBlock_m - kReach_m) {
@@ -180,10 +183,8 @@ TEST(TwinPlaces, AreNotTakenForOneThatWasNeverVisited) {
   for (unsigned seed = 1; seed <= 5; ++seed) {
     SCOPED_TRACE("seed " + std::to_string(seed));
     const Street street(5, true, seed);
-    Robot robot(street);
-    robot.Drive(0.0, 2 * kBlock_m);
     int recognitions = 0;
-    for (const Robot::Step& step : robot.Drive(3 * kBlock_m, 5 * kBlock_m)) {
+    for (const Robot::Step& step : DriveAgain(street, 3 * kBlock_m, 5 * kBlock_m)) {
       recognitions += step.result.counts.clique >= 6;
       EXPECT_FALSE(step.result.closure) << "at " << step.x << " m";
     }
