@@ -129,7 +129,8 @@ def overload(program, folder, style, config):
 
     def on_diagnostics(message):
         for status in message.status:
-            if status.name == "front_end: front end":
+            # "Node starting up", which diagnostic_updater publishes by itself, has no values.
+            if status.name == "front_end: front end" and status.values:
                 seen.append({value.key: float(value.value) for value in status.values})
     deadline = time.time() + TIMEOUT_S
     while not rosgraph.is_master_online() and time.time() < deadline:
