@@ -27,7 +27,7 @@ bool IsDeceptive(const Evidence& evidence, const AcceptanceParameters& parameter
 }
 
 Verdict Judge(const Evidence& evidence, const AcceptanceParameters& parameters) {
-  if (IsDeceptive(evidence, parameters)) {
+  if (IsDeceptive(evidence, parameters) && !evidence.on_proven_track) {
     const bool outdoes_rival =
         !HasRival(evidence, parameters) || evidence.distinction >= parameters.min_distinction;
     if (!outdoes_rival || evidence.track_m < parameters.min_track_m || evidence.track_fit < parameters.min_track_fit)
@@ -53,8 +53,9 @@ double Strength(const Evidence& evidence, const AcceptanceParameters& parameters
   const double borne_out = std::min({std::max(unrivalled, at_least(evidence.distinction, parameters.min_distinction)),
                                      at_least(evidence.track_m, parameters.min_track_m),
                                      at_most(1.0 - evidence.track_fit, 1.0 - parameters.min_track_fit)});
+  const double on_track = evidence.on_proven_track ? kUnbound : 0.0;
   return std::min(
-      {std::max(plain, borne_out), at_least(evidence.Coverage(), parameters.min_coverage),
+      {std::max({plain, borne_out, on_track}), at_least(evidence.Coverage(), parameters.min_coverage),
        at_most(evidence.contradiction, parameters.max_contradiction),
        at_most(evidence.contradiction_once, parameters.max_contradiction_once),
        at_most(evidence.sigma_m, parameters.max_sigma_m), at_most(evidence.sigma_rad, parameters.max_sigma_rad),

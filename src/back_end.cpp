@@ -40,12 +40,13 @@ SegmentDelta InContinuousFrame(const SegmentDelta& delta) {
 /// A step's results in odom as it is now.
 void TakeToJumpingFrame(const Pose& T_odom_continuous, BackEndStep* step) {
   for (SegmentMatch& match : step->candidates) match.centroid_local_odom = T_odom_continuous * match.centroid_local_odom;
-  for (std::optional<Closure>* closure : {&step->closure, &step->refused}) {
-    if (!*closure) continue;
-    (*closure)->T_map_odom = (*closure)->T_map_odom * T_odom_continuous.inverse();
-    for (SegmentMatch& match : (*closure)->matches)
-      match.centroid_local_odom = T_odom_continuous * match.centroid_local_odom;
-  }
+  const auto take = [&](Closure* closure) {
+    closure->T_map_odom = closure->T_map_odom * T_odom_continuous.inverse();
+    for (SegmentMatch& match : closure->matches) match.centroid_local_odom = T_odom_continuous * match.centroid_local_odom;
+  };
+  if (step->closure) take(&*step->closure);
+  if (step->refused) take(&*step->refused);
+  for (Closure& closure : step->settled) take(&closure);
 }
 
 }  // namespace
@@ -163,12 +164,13 @@ BackEndStep BackEnd::AttemptRecognition(RobotIndex robot, StageTimer timer) {
 
   step.counts.end = ToStepEnd(result.outcome);
   std::optional<Hypothesis> judged;
-  if (result.recognition) judged = Verify(robot, result, &step.counts);
+  if (result.recognition) judged = Verify(robot, result, &step);
   const bool is_recognized = step.counts.end == StepEnd::kRecognized;
   if (judged && HasRival(judged->closure.evidence, parameters_.acceptance) &&
       judged->closure.evidence.runner_up >= parameters_.acceptance.twin_size) {
     robots_[robot].twin_path_m = robots_[robot].path_m;
   }
+  for (const Closure& closure : step.settled) AcceptClosure(robot, closure);
   if (is_recognized) AcceptClosure(robot, judged->closure);
   if (IsLoopClosure()) KeepKeyframe(robot, is_recognized ? &*judged : nullptr);
   if (judged) (is_recognized ? step.closure : step.refused) = std::move(judged->closure);
@@ -505,7 +507,10 @@ void BackEnd::KeepKeyframe(RobotIndex index, const Hypothesis* recognized) {
 /// What was recognised is the same: remembered until the local segment's tracking ends.
 void BackEnd::AcceptClosure(RobotIndex robot, const Closure& closure) {
   if (!IsLoopClosure()) return;
-  for (const SegmentMatch& match : closure.matches) robots_[robot].local.at(match.local.id).same_as = match.target;
+  for (const SegmentMatch& match : closure.matches) {
+    const auto local = robots_[robot].local.find(match.local.id);
+    if (local != robots_[robot].local.end()) local->second.same_as = match.target;
+  }
   const RobotIndex target_robot = closure.matches.front().target.robot;
   if (robots_[robot].frame != robots_[target_robot].frame) JoinFrames(robot, target_robot, closure.T_map_odom);
 }

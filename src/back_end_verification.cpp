@@ -46,14 +46,15 @@ const SegmentView& BackEnd::MatchedView(RobotIndex robot, const Correspondence& 
 }
 
 /// Lays a recognition on scans, and where there is a rival, the rival as well: what fits better is the recognition. Gathers the
-/// evidence for it and judges that. `counts` gets the evidence and the end, which says whether what comes back is accepted.
-std::optional<BackEnd::Hypothesis> BackEnd::Verify(RobotIndex robot, const RecognizerResult& result,
-                                                   BackEndCounts* counts) {
-  std::optional<Hypothesis> best = LayOnScans(robot, *result.recognition, &counts->end);
-  if (result.runner_up && (!best || HasRival(best->closure.evidence, parameters_.acceptance))) {
+/// evidence for it and judges that. The step's counts get the evidence and the end, which says whether what comes back is
+/// accepted; with it, what waited for that is settled.
+std::optional<BackEnd::Hypothesis> BackEnd::Verify(RobotIndex robot, const RecognizerResult& result, BackEndStep* step) {
+  const AcceptanceParameters& limits = parameters_.acceptance;
+  std::optional<Hypothesis> best = LayOnScans(robot, *result.recognition, &step->counts.end);
+  if (result.runner_up && (!best || HasRival(best->closure.evidence, limits))) {
     StepEnd end;
     std::optional<Hypothesis> rival = LayOnScans(robot, *result.runner_up, &end);
-    if (rival && (!best || Distinction(*rival, *best) > 0.5)) std::swap(best, rival);
+    if (rival && (!best || IsBetter(robot, *rival, *best))) std::swap(best, rival);
     if (best) best->closure.evidence.distinction = rival ? Distinction(*best, *rival) : 1.0;
   }
   if (!best) return std::nullopt;
@@ -65,16 +66,46 @@ std::optional<BackEnd::Hypothesis> BackEnd::Verify(RobotIndex robot, const Recog
   evidence.distance_m = closure.T_target_query.translation().norm();
   evidence.sigma_m = LargestSigma(closure.covariance.topLeftCorner<3, 3>());
   evidence.sigma_rad = LargestSigma(closure.covariance.bottomRightCorner<3, 3>());
-  const bool is_deceptive = IsDeceptive(evidence, parameters_.acceptance);
-  if (is_deceptive && !best->fits.empty())
-    FollowTrack(robot, *best, evidence.overlap / ExpectedOverlap(best->target), &evidence);
-  const Verdict verdict = Judge(evidence, parameters_.acceptance);
-  // What is accepted without twins can be relied on.
-  if (!is_deceptive && verdict == Verdict::kAccepted) FollowTrack(robot, *best, 1.0, &evidence);
-  counts->evidence = evidence;
-  counts->end = ToStepEnd(verdict);
   closure.candidates = result.candidates;
+  const bool is_deceptive = IsDeceptive(evidence, limits);
+  Track* track = nullptr;
+  if (is_deceptive && !best->fits.empty())
+    track = &FollowTrack(robot, *best, evidence.overlap / ExpectedOverlap(best->target), &evidence);
+  const Verdict verdict = Judge(evidence, limits);
+  // What is accepted without twins can be relied on.
+  if (!is_deceptive && verdict == Verdict::kAccepted) track = &FollowTrack(robot, *best, 1.0, &evidence);
+  if (track != nullptr) SettleTrack(robot, closure, verdict, track, &step->settled);
+  step->counts.evidence = evidence;
+  step->counts.end = ToStepEnd(verdict);
   return best;
+}
+
+/// Of two hypotheses that which continues a proven track, unless scans speak for the other one; otherwise that which explains
+/// more of the scan.
+bool BackEnd::IsBetter(RobotIndex robot, const Hypothesis& first, const Hypothesis& second) const {
+  const double distinction = Distinction(first, second);
+  const bool first_on_track = IsOnProvenTrack(robot, first), second_on_track = IsOnProvenTrack(robot, second);
+  if (first_on_track == second_on_track) return distinction > 0.5;
+  return first_on_track ? distinction > 1.0 - parameters_.acceptance.min_distinction
+                        : distinction >= parameters_.acceptance.min_distinction;
+}
+
+/// A recognition that is accepted proves its track: what was recognised along it before is settled with it. One that is
+/// only ambiguous waits for that.
+void BackEnd::SettleTrack(RobotIndex robot, const Closure& closure, Verdict verdict, Track* track,
+                          std::vector<Closure>* settled) const {
+  const double path_m = robots_[robot].path_m;
+  std::deque<Candidate>& waiting = track->waiting;
+  while (!waiting.empty() && path_m - waiting.front().path_m > parameters_.history.length_m) waiting.pop_front();
+  if (verdict == Verdict::kAccepted) {
+    track->is_proven = true;
+    for (Candidate& candidate : waiting) settled->push_back(std::move(candidate.closure));
+    waiting.clear();
+  } else if (verdict == Verdict::kAmbiguous) {
+    Candidate candidate{path_m, closure};
+    candidate.closure.evidence.on_proven_track = true;  // when it will be accepted
+    if (Judge(candidate.closure.evidence, parameters_.acceptance) == Verdict::kAccepted) waiting.push_back(std::move(candidate));
+  }
 }
 
 /// A recognition as a closure to the key frame there, refined on scans. Nothing, and why, if that can't be.
@@ -109,23 +140,34 @@ double BackEnd::Distinction(const Hypothesis& first, const Hypothesis& second) {
   return all == 0 ? 0.5 : static_cast<double>(only_first) / static_cast<double>(all);
 }
 
-/// Recognitions that agree by odometry make a track. Adds a hypothesis to the one that it continues, and says how long that is,
-/// and how well the scans have fitted along it.
-void BackEnd::FollowTrack(RobotIndex index, const Hypothesis& hypothesis, double fit, Evidence* evidence) {
-  Robot& robot = robots_[index];
+/// Of the tracks that end hereabouts the one that a hypothesis continues, by odometry: the first. None: the end.
+std::vector<BackEnd::Track>::const_iterator BackEnd::FindTrack(RobotIndex index, const Hypothesis& hypothesis) const {
+  const Robot& robot = robots_[index];
   const auto position = [&](const KeyframeName& target, const Pose& T_target_sensor) {
     return Eigen::Vector3d((PoseOf(target).T_map_sensor * T_target_sensor).translation());
   };
+  const Eigen::Vector3d place = position(hypothesis.target, hypothesis.closure.T_target_query);
+  return std::find_if(robot.tracks.begin(), robot.tracks.end(), [&](const Track& track) {
+    if (robot.path_m - track.fits.back().path_m > parameters_.history.spacing_m) return false;
+    const Pose T_target_now = track.T_target_query * track.T_odom_sensor.inverse() * robot.T_odom_sensor;
+    return (position(track.target, T_target_now) - place).norm() <= parameters_.recognizer.same_place_m;
+  });
+}
+
+bool BackEnd::IsOnProvenTrack(RobotIndex robot, const Hypothesis& hypothesis) const {
+  const auto track = FindTrack(robot, hypothesis);
+  return track != robots_[robot].tracks.end() && track->is_proven;
+}
+
+/// Recognitions that agree by odometry make a track. Adds a hypothesis to the one that it continues, and says how long that is,
+/// how well the scans have fitted along it, and whether it is proven.
+BackEnd::Track& BackEnd::FollowTrack(RobotIndex index, const Hypothesis& hypothesis, double fit, Evidence* evidence) {
+  Robot& robot = robots_[index];
   const auto is_over = [&](const Track& track) {
     return robot.path_m - track.fits.back().path_m > parameters_.history.spacing_m;
   };
   robot.tracks.erase(std::remove_if(robot.tracks.begin(), robot.tracks.end(), is_over), robot.tracks.end());
-  const Eigen::Vector3d place = position(hypothesis.target, hypothesis.closure.T_target_query);
-  const auto continues = [&](const Track& track) {
-    const Pose T_target_now = track.T_target_query * track.T_odom_sensor.inverse() * robot.T_odom_sensor;
-    return (position(track.target, T_target_now) - place).norm() <= parameters_.recognizer.same_place_m;
-  };
-  auto track = std::find_if(robot.tracks.begin(), robot.tracks.end(), continues);
+  auto track = robot.tracks.begin() + (FindTrack(index, hypothesis) - robot.tracks.cbegin());
   if (track == robot.tracks.end()) track = robot.tracks.insert(track, Track{});
   track->target = hypothesis.target;
   track->T_target_query = hypothesis.closure.T_target_query;
@@ -136,6 +178,8 @@ void BackEnd::FollowTrack(RobotIndex index, const Hypothesis& hypothesis, double
     track->fits.pop_front();
   evidence->track_m = robot.path_m - track->fits.front().path_m;
   for (const Fit& link : track->fits) evidence->track_fit += link.value / static_cast<double>(track->fits.size());
+  evidence->on_proven_track = track->is_proven;
+  return *track;
 }
 
 /// How much of a key frame's scan lies on those of its neighbours along the trajectory: what can be expected of a scan that is

@@ -40,6 +40,7 @@ struct Evidence {
   double distinction = 0.0;  ///< of the scan's points that fit only one of this and the rival's place: share that fits this
   double track_m = 0.0;      ///< path over which recognitions agree by odometry; where there are twins, a rival, or acceptance
   double track_fit = 0.0;    ///< mean overlap over that path, over the overlap that the map's scans have with each other
+  bool on_proven_track = false;  ///< one of those recognitions had all the evidence that it needed: where it is, this is
   std::size_t expected = 0;   ///< local segments where the map was seen
   std::size_t supported = 0;  ///< of them, those with a target segment in their place
   double overlap =

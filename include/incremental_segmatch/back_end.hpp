@@ -138,6 +138,7 @@ struct BackEndCounts {
 struct BackEndStep {
   std::optional<Closure> closure;  ///< the place, if one was recognised
   std::optional<Closure> refused;  ///< what was recognised, but refused for its evidence (counts.end says why)
+  std::vector<Closure> settled;    ///< of earlier steps, refused as ambiguous: with this one they are certain; oldest first
   bool missed_delta = false;       ///< a delta is missing: ask the robot for a full state; this one was not applied
   std::vector<SegmentMatch> candidates;  ///< all that entered recognition
   BackEndCounts counts;                  ///< the funnel
@@ -208,12 +209,19 @@ class BackEnd {
     double path_m = 0.0;
     double value = 0.0;  // its overlap over what could be expected
   };
+  // A closure that would be accepted, were it not ambiguous.
+  struct Candidate {
+    double path_m = 0.0;  // of the robot, there
+    Closure closure;
+  };
   // Recognitions that agree with each other by odometry.
   struct Track {
     KeyframeName target;  // of the last one
     Pose T_target_query;
     Pose T_odom_sensor;
     std::deque<Fit> fits;  // along the way
+    bool is_proven = false;  // one of them was accepted
+    std::deque<Candidate> waiting;  // ambiguous ones, until then
   };
   // A place where the robot may be.
   struct Hypothesis {
@@ -267,10 +275,14 @@ class BackEnd {
   bool NeedsQuery(RobotIndex robot, const LocalSegment& segment) const;
   std::map<RobotIndex, Correspondences> CollectCorrespondences(RobotIndex robot) const;
   RecognizerResult Recognize(RobotIndex robot, const std::map<RobotIndex, Correspondences>& by_frame);
-  std::optional<Hypothesis> Verify(RobotIndex robot, const RecognizerResult& result, BackEndCounts* counts);
+  std::optional<Hypothesis> Verify(RobotIndex robot, const RecognizerResult& result, BackEndStep* step);
   std::optional<Hypothesis> LayOnScans(RobotIndex robot, const Recognition& recognition, StepEnd* end);
   static double Distinction(const Hypothesis& first, const Hypothesis& second);
-  void FollowTrack(RobotIndex robot, const Hypothesis& hypothesis, double fit, Evidence* evidence);
+  bool IsBetter(RobotIndex robot, const Hypothesis& first, const Hypothesis& second) const;
+  std::vector<Track>::const_iterator FindTrack(RobotIndex robot, const Hypothesis& hypothesis) const;
+  bool IsOnProvenTrack(RobotIndex robot, const Hypothesis& hypothesis) const;
+  Track& FollowTrack(RobotIndex robot, const Hypothesis& hypothesis, double fit, Evidence* evidence);
+  void SettleTrack(RobotIndex robot, const Closure& closure, Verdict verdict, Track* track, std::vector<Closure>* settled) const;
   double ExpectedOverlap(const KeyframeName& keyframe);
   const SegmentView& MatchedView(RobotIndex robot, const Correspondence& inlier) const;
   const TrajectoryPose& PoseOf(const KeyframeName& keyframe) const;

@@ -182,6 +182,7 @@ std::vector<EvidenceColumn> EvidenceColumns() {
           {"distinction", [](const Evidence& e) { return e.distinction; }},
           {"track_m", [](const Evidence& e) { return e.track_m; }},
           {"track_fit", [](const Evidence& e) { return e.track_fit; }},
+          {"on_proven_track", [](const Evidence& e) { return e.on_proven_track; }},
           {"expected", [](const Evidence& e) { return e.expected; }},
           {"supported", [](const Evidence& e) { return e.supported; }},
           {"contradiction", [](const Evidence& e) { return e.contradiction; }},

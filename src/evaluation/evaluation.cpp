@@ -53,20 +53,20 @@ class LoopCloser {
       : parameters_(parameters), graph_(parameters.pose_graph) {}
 
   void AddPose(const StampedPose& odometry) {
-    if (started_) travelled_m_ += (odometry.T_frame_sensor.translation() - last_position_).norm();
-    started_ = true;
+    if (!path_m_.empty()) travelled_m_ += (odometry.T_frame_sensor.translation() - last_position_).norm();
+    path_m_.push_back(travelled_m_);
     last_position_ = odometry.T_frame_sensor.translation();
     graph_.AddNode(kRobot, odometry.stamp_ns, odometry.T_frame_sensor);
   }
 
-  // True if the closure entered the graph.
-  bool AddClosure(const Closure& closure) {
-    if (travelled_m_ - last_closure_m_ < parameters_.closure_spacing_m) return false;
+  // Of the scan of a step. True if the closure entered the graph.
+  bool AddClosure(const Closure& closure, std::size_t step) {
+    if (path_m_[step] - last_closure_m_ < parameters_.closure_spacing_m) return false;
     if (!graph_.AddClosure(kRobot, closure.stamp_target_ns, kRobot, closure.stamp_query_ns, closure.T_target_query,
                            closure.covariance)) {
       return false;
     }
-    last_closure_m_ = travelled_m_;
+    last_closure_m_ = path_m_[step];
     has_new_closure_ = true;
     return true;
   }
@@ -95,7 +95,7 @@ class LoopCloser {
   const EvaluationParameters& parameters_;
   PoseGraph graph_;
   PoseGraphReport report_;
-  bool started_ = false;
+  std::vector<double> path_m_;  // at each step
   bool has_new_closure_ = false;
   Eigen::Vector3d last_position_ = Eigen::Vector3d::Zero();
   double travelled_m_ = 0.0;
@@ -115,6 +115,12 @@ std::optional<TrueTrajectory> ReadTruth(const DriveSource& drive, std::size_t st
   return truth;
 }
 
+// Of recognitions in the order of the drive the one of a scan.
+JudgedRecognition& RecognitionAt(StampNs stamp_ns, std::vector<JudgedRecognition>* recognitions) {
+  return *std::lower_bound(recognitions->begin(), recognitions->end(), stamp_ns,
+                           [](const JudgedRecognition& r, StampNs stamp) { return r.closure.stamp_query_ns < stamp; });
+}
+
 // Scores what was accepted, and judges all that was judged.
 void ScoreResult(const ScoringParameters& parameters, EvaluationResult* result) {
   const auto score = [&](const std::vector<ClosureRow>& closures) {
@@ -122,6 +128,10 @@ void ScoreResult(const ScoringParameters& parameters, EvaluationResult* result) 
                              : ScoreClosures(*result->truth, closures, parameters);
   };
   result->score = score(result->closures);
+  std::vector<ClosureRow> at_once;
+  for (const JudgedRecognition& recognition : result->recognitions)
+    if (recognition.end == StepEnd::kRecognized) at_once.push_back(recognition.closure);
+  result->score_at_once = score(at_once);
   std::vector<ClosureRow> rows;
   for (const JudgedRecognition& recognition : result->recognitions) rows.push_back(recognition.closure);
   const Score judged = score(rows);
@@ -215,16 +225,24 @@ EvaluationResult Evaluate(DriveSource& drive, const EvaluationParameters& parame
     record.back_end = recognized.counts;
     record.described = seen.delta.changed.size();
     result.odometry.push_back({scan.stamp_ns, scan.T_odom_sensor});
-    if (recognized.closure) result.closures.push_back(ToRow(*recognized.closure));
+    std::vector<Closure> accepted = recognized.settled;
+    if (recognized.closure) accepted.push_back(*recognized.closure);
+    for (const Closure& closure : accepted) result.closures.push_back(ToRow(closure));
+    for (const Closure& closure : recognized.settled) {
+      JudgedRecognition& recognition = RecognitionAt(closure.stamp_query_ns, &result.recognitions);
+      recognition.evidence = closure.evidence;
+      recognition.settled_by = i;
+    }
     if (const std::optional<Closure>& judged = recognized.closure ? recognized.closure : recognized.refused)
       result.recognitions.push_back({i, ToRow(*judged), judged->evidence, recognized.counts.end, {}});
 
     if (optimize) {
       closer.AddPose(result.odometry.back());
       const Stopwatch optimization;
-      if (recognized.closure && closer.AddClosure(*recognized.closure)) {
-        result.graph_closures.push_back(
-            {StepAt(result.odometry, recognized.closure->stamp_target_ns), i, recognized.closure->covariance});
+      for (const Closure& closure : accepted) {
+        const std::size_t query = StepAt(result.odometry, closure.stamp_query_ns);
+        if (closer.AddClosure(closure, query))
+          result.graph_closures.push_back({StepAt(result.odometry, closure.stamp_target_ns), query, closure.covariance});
       }
       if (closer.CorrectIfDue(back_end)) record.optimize_ms = optimization.Milliseconds();
     }

@@ -64,6 +64,8 @@ struct JudgedRecognition {
   Evidence evidence;
   StepEnd end = StepEnd::kRecognized;  ///< kRecognized: accepted
   JudgedClosure judged;                ///< against the truth, where there is one
+  std::optional<std::size_t> settled_by = std::nullopt;  ///< refused as ambiguous at first, accepted with a later step: which
+  bool is_accepted() const { return end == StepEnd::kRecognized || settled_by; }
 };
 
 /// Root mean square position errors after alignment, in metres.
@@ -93,6 +95,7 @@ struct EvaluationResult {
   std::optional<TrueTrajectory> truth;               ///< where there is ground truth
   std::optional<TrueTrajectory> map_truth;           ///< of the map's drive, in localization, where it is known
   std::optional<Score> score;                        ///< where there is ground truth
+  std::optional<Score> score_at_once;                ///< the same without what a later step settled
   std::vector<TruePair> true_pairs;                  ///< at revisits, where there is ground truth
   std::optional<TrajectoryErrors> trajectory_error;  ///< where there is ground truth and optimization
 };

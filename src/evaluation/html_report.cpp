@@ -233,7 +233,7 @@ std::string Map(const EvaluationResult& result, const std::vector<Stretch>& stre
   };
   if (!result.score) {
     for (const JudgedRecognition& recognition : result.recognitions) {
-      if (recognition.end == StepEnd::kRecognized)
+      if (recognition.is_accepted())
         svg.Circle(at(recognition.step).x(), at(recognition.step).y(), 2, "unjudged", tip(recognition.step));
     }
   } else {
