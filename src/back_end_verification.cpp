@@ -48,14 +48,23 @@ const SegmentView& BackEnd::MatchedView(RobotIndex robot, const Correspondence& 
 /// Lays a recognition on scans, and where there is a rival, the rival as well: what fits better is the recognition. Gathers the
 /// evidence for it and judges that. The step's counts get the evidence and the end, which says whether what comes back is
 /// accepted; with it, what waited for that is settled.
-std::optional<BackEnd::Hypothesis> BackEnd::Verify(RobotIndex robot, const RecognizerResult& result, BackEndStep* step) {
+std::optional<BackEnd::Hypothesis> BackEnd::Verify(RobotIndex robot, const std::map<RobotIndex, Correspondences>& by_frame,
+                                                   const RecognizerResult& result, BackEndStep* step) {
   const AcceptanceParameters& limits = parameters_.acceptance;
-  std::optional<Hypothesis> best = LayOnScans(robot, *result.recognition, &step->counts.end);
+  std::optional<Hypothesis> best;
+  if (result.recognition) best = LayOnScans(robot, *result.recognition, &step->counts.end);
   if (result.runner_up && (!best || HasRival(best->closure.evidence, limits))) {
     StepEnd end;
     std::optional<Hypothesis> rival = LayOnScans(robot, *result.runner_up, &end);
     if (rival && (!best || IsBetter(robot, *rival, *best))) std::swap(best, rival);
     if (best) best->closure.evidence.distinction = rival ? Distinction(*best, *rival) : 1.0;
+  }
+  if (!best || !IsOnProvenTrack(robot, *best)) {
+    std::optional<Hypothesis> along = ContinueTrack(robot, by_frame, result.clique_size);
+    if (along && (!best || IsBetter(robot, *along, *best))) {
+      along->closure.evidence.distinction = best ? Distinction(*along, *best) : 1.0;
+      best = std::move(along);
+    }
   }
   if (!best) return std::nullopt;
 
@@ -78,6 +87,37 @@ std::optional<BackEnd::Hypothesis> BackEnd::Verify(RobotIndex robot, const Recog
   step->counts.evidence = evidence;
   step->counts.end = ToStepEnd(verdict);
   return best;
+}
+
+/// The place where a proven track goes on, if enough matches agree there, be it fewer than elsewhere.
+std::optional<BackEnd::Hypothesis> BackEnd::ContinueTrack(RobotIndex index, const std::map<RobotIndex, Correspondences>& by_frame,
+                                                          std::size_t rival_size) {
+  const Robot& robot = robots_[index];
+  const auto track = std::find_if(robot.tracks.rbegin(), robot.tracks.rend(),
+                                  [&](const Track& track) { return track.is_proven && !IsOver(index, track); });
+  if (track == robot.tracks.rend()) return std::nullopt;
+  const auto matches = by_frame.find(robots_[track->target.robot].frame);
+  if (matches == by_frame.end()) return std::nullopt;
+  const Pose T_map_odom = PlaceNow(index, *track) * robot.T_odom_sensor.inverse();
+  Correspondences there;
+  for (const Correspondence& c : matches->second)
+    if ((T_map_odom * c.centroid_local - c.centroid_target).norm() <= parameters_.recognizer.same_place_m) there.push_back(c);
+  std::optional<Recognition> recognition = Recognizer(parameters_.recognizer).Recognize(there).recognition;
+  if (!recognition) return std::nullopt;
+  recognition->runner_up_size = rival_size;
+  StepEnd end;
+  std::optional<Hypothesis> hypothesis = LayOnScans(index, *recognition, &end);
+  if (hypothesis && !IsOnProvenTrack(index, *hypothesis)) return std::nullopt;
+  return hypothesis;
+}
+
+/// Where a track puts the sensor now, by odometry, in the map.
+Pose BackEnd::PlaceNow(RobotIndex robot, const Track& track) const {
+  return PoseOf(track.target).T_map_sensor * track.T_target_query * track.T_odom_sensor.inverse() * robots_[robot].T_odom_sensor;
+}
+
+bool BackEnd::IsOver(RobotIndex robot, const Track& track) const {
+  return robots_[robot].path_m - track.fits.back().path_m > parameters_.history.spacing_m;
 }
 
 /// Of two hypotheses that which continues a proven track, unless scans speak for the other one; otherwise that which explains
@@ -142,15 +182,11 @@ double BackEnd::Distinction(const Hypothesis& first, const Hypothesis& second) {
 
 /// Of the tracks that end hereabouts the one that a hypothesis continues, by odometry: the first. None: the end.
 std::vector<BackEnd::Track>::const_iterator BackEnd::FindTrack(RobotIndex index, const Hypothesis& hypothesis) const {
-  const Robot& robot = robots_[index];
-  const auto position = [&](const KeyframeName& target, const Pose& T_target_sensor) {
-    return Eigen::Vector3d((PoseOf(target).T_map_sensor * T_target_sensor).translation());
-  };
-  const Eigen::Vector3d place = position(hypothesis.target, hypothesis.closure.T_target_query);
-  return std::find_if(robot.tracks.begin(), robot.tracks.end(), [&](const Track& track) {
-    if (robot.path_m - track.fits.back().path_m > parameters_.history.spacing_m) return false;
-    const Pose T_target_now = track.T_target_query * track.T_odom_sensor.inverse() * robot.T_odom_sensor;
-    return (position(track.target, T_target_now) - place).norm() <= parameters_.recognizer.same_place_m;
+  const std::vector<Track>& tracks = robots_[index].tracks;
+  const Eigen::Vector3d place = (PoseOf(hypothesis.target).T_map_sensor * hypothesis.closure.T_target_query).translation();
+  return std::find_if(tracks.begin(), tracks.end(), [&](const Track& track) {
+    return !IsOver(index, track) &&
+           (PlaceNow(index, track).translation() - place).norm() <= parameters_.recognizer.same_place_m;
   });
 }
 
@@ -163,10 +199,9 @@ bool BackEnd::IsOnProvenTrack(RobotIndex robot, const Hypothesis& hypothesis) co
 /// how well the scans have fitted along it, and whether it is proven.
 BackEnd::Track& BackEnd::FollowTrack(RobotIndex index, const Hypothesis& hypothesis, double fit, Evidence* evidence) {
   Robot& robot = robots_[index];
-  const auto is_over = [&](const Track& track) {
-    return robot.path_m - track.fits.back().path_m > parameters_.history.spacing_m;
-  };
-  robot.tracks.erase(std::remove_if(robot.tracks.begin(), robot.tracks.end(), is_over), robot.tracks.end());
+  robot.tracks.erase(std::remove_if(robot.tracks.begin(), robot.tracks.end(),
+                                    [&](const Track& track) { return IsOver(index, track); }),
+                     robot.tracks.end());
   auto track = robot.tracks.begin() + (FindTrack(index, hypothesis) - robot.tracks.cbegin());
   if (track == robot.tracks.end()) track = robot.tracks.insert(track, Track{});
   track->target = hypothesis.target;

@@ -275,10 +275,15 @@ class BackEnd {
   bool NeedsQuery(RobotIndex robot, const LocalSegment& segment) const;
   std::map<RobotIndex, Correspondences> CollectCorrespondences(RobotIndex robot) const;
   RecognizerResult Recognize(RobotIndex robot, const std::map<RobotIndex, Correspondences>& by_frame);
-  std::optional<Hypothesis> Verify(RobotIndex robot, const RecognizerResult& result, BackEndStep* step);
+  std::optional<Hypothesis> Verify(RobotIndex robot, const std::map<RobotIndex, Correspondences>& by_frame,
+                                   const RecognizerResult& result, BackEndStep* step);
+  std::optional<Hypothesis> ContinueTrack(RobotIndex robot, const std::map<RobotIndex, Correspondences>& by_frame,
+                                          std::size_t rival_size);
   std::optional<Hypothesis> LayOnScans(RobotIndex robot, const Recognition& recognition, StepEnd* end);
   static double Distinction(const Hypothesis& first, const Hypothesis& second);
   bool IsBetter(RobotIndex robot, const Hypothesis& first, const Hypothesis& second) const;
+  Pose PlaceNow(RobotIndex robot, const Track& track) const;
+  bool IsOver(RobotIndex robot, const Track& track) const;
   std::vector<Track>::const_iterator FindTrack(RobotIndex robot, const Hypothesis& hypothesis) const;
   bool IsOnProvenTrack(RobotIndex robot, const Hypothesis& hypothesis) const;
   Track& FollowTrack(RobotIndex robot, const Hypothesis& hypothesis, double fit, Evidence* evidence);
