@@ -117,7 +117,7 @@ Pose BackEnd::PlaceNow(RobotIndex robot, const Track& track) const {
 }
 
 bool BackEnd::IsOver(RobotIndex robot, const Track& track) const {
-  return robots_[robot].path_m - track.fits.back().path_m > parameters_.history.spacing_m;
+  return robots_[robot].path_m - track.fits.back().path_m > parameters_.acceptance.min_track_m;
 }
 
 /// Of two hypotheses that which continues a proven track, unless scans speak for the other one; otherwise that which explains
@@ -207,6 +207,8 @@ BackEnd::Track& BackEnd::FollowTrack(RobotIndex index, const Hypothesis& hypothe
   track->target = hypothesis.target;
   track->T_target_query = hypothesis.closure.T_target_query;
   track->T_odom_sensor = robot.T_odom_sensor;
+  if (!track->fits.empty() && robot.path_m - track->fits.back().path_m > parameters_.history.spacing_m)
+    track->fits.clear();  // what lies between speaks for nothing
   track->fits.push_back({robot.path_m, std::min(1.0, fit)});
   // As long as need be, and no longer.
   while (track->fits.size() > 1 && robot.path_m - track->fits[1].path_m >= parameters_.acceptance.min_track_m)
