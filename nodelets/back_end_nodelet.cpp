@@ -49,15 +49,20 @@ std::vector<SegmentMatch> RefusedMatches(const BackEndStep& step) {
   return refused;
 }
 
-/// Where a robot was at a stamp of its trajectory, in the map.
-std::optional<Eigen::Vector3d> PositionAt(const TargetMap& map, const std::string& robot, StampNs stamp_ns) {
+/// The pose of a robot at a stamp of its trajectory; null: there is none.
+const TrajectoryPose* PoseAt(const TargetMap& map, const std::string& robot, StampNs stamp_ns) {
   const std::optional<RobotIndex> index = FindRobot(map, robot);
-  if (!index) return std::nullopt;
+  if (!index) return nullptr;
   const std::vector<TrajectoryPose>& trajectory = map.Trajectory(*index);
   const auto pose = std::lower_bound(trajectory.begin(), trajectory.end(), stamp_ns,
                                      [](const TrajectoryPose& p, StampNs stamp) { return p.stamp_ns < stamp; });
-  if (pose == trajectory.end() || pose->stamp_ns != stamp_ns) return std::nullopt;
-  return pose->T_map_sensor.translation();
+  return pose != trajectory.end() && pose->stamp_ns == stamp_ns ? &*pose : nullptr;
+}
+
+/// How far the robot had gone when it took the scan that recognised the place.
+double PathAtQuery(const TargetMap& map, const Closure& closure) {
+  const TrajectoryPose* const query = PoseAt(map, closure.robot_query, closure.stamp_query_ns);
+  return query == nullptr ? 0.0 : query->path_m;
 }
 
 }  // namespace
@@ -330,11 +335,7 @@ void BackEndNodelet::ProcessSegments(const SegmentArray& message, const std::str
 }
 
 BackEndNodelet::Robot& BackEndNodelet::Meet(const std::string& session, const SegmentArray& message) {
-  const auto [it, is_new] = robots_.try_emplace(session);
-  Robot& robot = it->second;
-  const Pose T_continuous_sensor = ContinuousSensorPose(message);
-  const Pose last_T_continuous_sensor = robot.T_odom_continuous.inverse() * robot.T_odom_sensor;
-  if (!is_new) robot.path_m += (T_continuous_sensor.translation() - last_T_continuous_sensor.translation()).norm();
+  Robot& robot = robots_[session];
   robot.name = message.robot;
   robot.frames = ToRobotFrames(message);
   robot.stamp_ns = ToStampNs(message.header.stamp);
@@ -412,11 +413,14 @@ void BackEndNodelet::CorrectPose(const std::string& robot_name, const nav_msgs::
 }
 
 void BackEndNodelet::Publish(const BackEndStep& step, const std::string& session, Robot& robot) {
+  for (const Closure& closure : step.settled) {
+    Record(closure);
+    if (!IsLocalization() && IsDue(closure, robot)) PublishClosure(closure, robot);
+  }
   if (step.closure) {
     const Closure& closure = *step.closure;
     robot.T_map_continuous = closure.T_map_odom * robot.T_odom_continuous;
-    closures_.push_back({closure.robot_query, closure.stamp_query_ns, closure.robot_target, closure.stamp_target_ns});
-    if (closure_log_) closure_log_->Add(closure);
+    Record(closure);
     if (throttle_.IsDue("recognized", kRecognizedPeriod_s))
       NODELET_INFO("%s at %.1f s is where %s was at %.1f s: %zu of %zu matches agree (recognition %zu)",
                    closure.robot_query.c_str(), 1e-9 * static_cast<double>(closure.stamp_query_ns),
@@ -441,10 +445,16 @@ void BackEndNodelet::Publish(const BackEndStep& step, const std::string& session
   }
 }
 
+/// What was accepted, for the display and the file.
+void BackEndNodelet::Record(const Closure& closure) {
+  closures_.push_back({closure.robot_query, closure.stamp_query_ns, closure.robot_target, closure.stamp_target_ns});
+  if (closure_log_) closure_log_->Add(closure);
+}
+
 bool BackEndNodelet::IsDue(const Closure& closure, const Robot& robot) const {
   if (!robot.published_path_m) return true;
   const double interval_s = 1e-9 * static_cast<double>(closure.stamp_query_ns - robot.published_ns);
-  return robot.path_m - *robot.published_path_m >= parameters_.closure_min_distance_m &&
+  return PathAtQuery(back_end_->map(), closure) - *robot.published_path_m >= parameters_.closure_min_distance_m &&
          interval_s >= parameters_.closure_min_interval_s;
 }
 
@@ -460,7 +470,7 @@ void BackEndNodelet::PublishClosure(const Closure& closure, Robot& robot) {
       NODELET_WARN("the base frame of %s in the loaded map is not known: closures to it are between the sensors",
                    closure.robot_target.c_str());
   }
-  robot.published_path_m = robot.path_m;
+  robot.published_path_m = PathAtQuery(back_end_->map(), closure);
   robot.published_ns = closure.stamp_query_ns;
   closures_publisher_.publish(boost::make_shared<const LoopClosure>(
       ToLoopClosure(closure, kind, robot.frames, target_frames, back_end_->map())));
@@ -519,9 +529,10 @@ void BackEndNodelet::PublishMap(const std::string& session, const Robot& robot) 
 void BackEndNodelet::PublishClosureLines(const std_msgs::Header& header) {
   std::vector<Line> lines;
   for (const ClosureEnds& ends : closures_) {
-    const auto query = PositionAt(back_end_->map(), ends.robot_query, ends.stamp_query_ns);
-    const auto target = PositionAt(back_end_->map(), ends.robot_target, ends.stamp_target_ns);
-    if (query && target) lines.emplace_back(*query, *target);
+    const TrajectoryPose* const query = PoseAt(back_end_->map(), ends.robot_query, ends.stamp_query_ns);
+    const TrajectoryPose* const target = PoseAt(back_end_->map(), ends.robot_target, ends.stamp_target_ns);
+    if (query != nullptr && target != nullptr)
+      lines.emplace_back(query->T_map_sensor.translation(), target->T_map_sensor.translation());
   }
   closure_lines_publisher_.publish(LineMarker(lines, kClosureStyle, header));
 }
@@ -564,7 +575,7 @@ void BackEndNodelet::Report(const BackEndStep& step) {
   const std::size_t memory_bytes = measure ? back_end_->memory_bytes() : 0;
   const std::lock_guard<std::mutex> lock(mutex_);
   ++status_.processed;
-  if (step.closure) ++status_.recognitions;
+  status_.recognitions += step.settled.size() + (step.closure ? 1 : 0);
   ++status_.ends[ToString(step.counts.end)];
   status_.counts = step.counts;
   status_.times = step.times;

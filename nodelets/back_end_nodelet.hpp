@@ -56,9 +56,8 @@ class BackEndNodelet : public nodelet::Nodelet {
     Pose T_odom_sensor = Pose::Identity();
     Pose T_odom_continuous = Pose::Identity();  ///< jumps of odometry
     std::optional<Pose> T_map_continuous;       ///< of the last recognition
-    double path_m = 0.0;
-    std::vector<StampedPose> corrected;      ///< that came one by one: T_map_sensor, ascending stamps
-    std::optional<double> published_path_m;  ///< at the last published closure
+    std::vector<StampedPose> corrected;         ///< that came one by one: T_map_sensor, ascending stamps
+    std::optional<double> published_path_m;     ///< at the query of the last published closure
     StampNs published_ns = 0;
   };
 
@@ -111,6 +110,7 @@ class BackEndNodelet : public nodelet::Nodelet {
   void CorrectTrajectory(const std::string& robot, const nav_msgs::Path& path);
   void CorrectPose(const std::string& robot, const nav_msgs::Odometry& odometry);
   void Publish(const BackEndStep& step, const std::string& session, Robot& robot);
+  void Record(const Closure& closure);
   bool IsDue(const Closure& closure, const Robot& robot) const;
   void PublishClosure(const Closure& closure, Robot& robot);
   void PublishLocalization(const Closure& closure, const Robot& robot);

@@ -74,9 +74,10 @@ std::vector<MissedRevisit> FindMissedRevisits(const EvaluationResult& result) {
     miss.target_step = *score.revisit_targets[i];
     const StepEnd end = result.steps[i].back_end.end;
     const auto verdict = verdicts.find(i);
-    miss.cause = end != StepEnd::kRecognized
-                     ? ToString(end)
-                     : CauseOf(verdict == verdicts.end() ? ClosureVerdict::kUnmatched : verdict->second);
+    if (verdict != verdicts.end())
+      miss.cause = CauseOf(verdict->second);
+    else
+      miss.cause = end == StepEnd::kRecognized ? CauseOf(ClosureVerdict::kUnmatched) : ToString(end);
     missed.push_back(miss);
   }
   return missed;
@@ -231,7 +232,7 @@ std::vector<ThesisFigure> CompareWithThesis(const EvaluationResult& result) {
       {"localized_share", "share of the steps with a correct localization or closure",
        "0.83 (KITTI localization), 0.07 (KITTI loop closure), 0.93 (power plant)", LocalizedShare(result), "%.3f"},
       {"gaps_within_1_5_m", "distances between localizations below 1.5 m", "over 0.90; the original's less than 0.10",
-       result.score ? ShareWithin(result.score->gaps_m, 1.5) : kNaN, "%.3f"}};
+       result.score_at_once ? ShareWithin(result.score_at_once->gaps_m, 1.5) : kNaN, "%.3f"}};
 }
 
 }  // namespace incremental_segmatch

@@ -43,18 +43,23 @@ const char* ToString(ClosureVerdict verdict) {
   return "";
 }
 
-// Of the recognition of each step that was judged, accepted or not: whether it is true.
-std::vector<std::string> Verdicts(const EvaluationResult& result) {
-  std::vector<std::string> verdicts(result.steps.size());
-  if (!result.score) return verdicts;
-  for (const JudgedRecognition& recognition : result.recognitions)
-    verdicts[recognition.step] = ToString(recognition.judged.verdict);
-  return verdicts;
+// Of the recognition of each step that was judged, accepted or not: the later step that settled it, and whether it is true.
+struct Judgement {
+  std::string settled_by, verdict;
+};
+std::vector<Judgement> Judgements(const EvaluationResult& result) {
+  std::vector<Judgement> judgements(result.steps.size());
+  for (const JudgedRecognition& recognition : result.recognitions) {
+    Judgement& judgement = judgements[recognition.step];
+    if (recognition.settled_by) judgement.settled_by = std::to_string(*recognition.settled_by);
+    if (result.score) judgement.verdict = ToString(recognition.judged.verdict);
+  }
+  return judgements;
 }
 
 void WriteStepsCsv(const EvaluationResult& result, const std::string& path) {
   const std::vector<StepRecord>& steps = result.steps;
-  const std::vector<std::string> verdicts = Verdicts(result);
+  const std::vector<Judgement> judgements = Judgements(result);
   std::ofstream file(path);
   if (!file) throw std::runtime_error("can't write " + path);
   const std::vector<std::string> stages = StageNames(steps);
@@ -66,7 +71,7 @@ void WriteStepsCsv(const EvaluationResult& result, const std::string& path) {
   const std::vector<EvidenceColumn> evidence = EvidenceColumns();
   for (const FunnelColumn& column : counts) file << ',' << column.name;
   for (const EvidenceColumn& column : evidence) file << ',' << column.name;
-  file << ",end,revisit,verdict";
+  file << ",end,settled_by,revisit,verdict";
   const bool has_batch = !steps.empty() && steps.front().batch.has_value();
   if (has_batch) WriteBatchHeader(*steps.front().batch, file);
   file << '\n';
@@ -80,8 +85,8 @@ void WriteStepsCsv(const EvaluationResult& result, const std::string& path) {
       file << ',';
       if (step.back_end.evidence) file << column.value(*step.back_end.evidence);
     }
-    file << ',' << ToString(step.back_end.end);
-    file << ',' << RevisitOf(result, i) << ',' << verdicts[i];
+    file << ',' << ToString(step.back_end.end) << ',' << judgements[i].settled_by;
+    file << ',' << RevisitOf(result, i) << ',' << judgements[i].verdict;
     if (has_batch) WriteBatchColumns(*step.batch, file);
     file << '\n';
   }
@@ -116,6 +121,14 @@ void WriteMissedCsv(const EvaluationResult& result, const std::string& path) {
   if (!file) throw std::runtime_error("writing " + path + " failed: is the disk full?");
 }
 
+Json GapsJson(const Score& score) {
+  return {{"p50", score.gap_50_m},
+          {"p90", score.gap_90_m},
+          {"p99", score.gap_99_m},
+          {"max", score.gap_max_m},
+          {"share_within_1_5_m", ShareWithin(score.gaps_m, 1.5)}};
+}
+
 Json ScoreJson(const Score& score) {
   return {
       {"revisits", score.revisits},
@@ -135,12 +148,7 @@ Json ScoreJson(const Score& score) {
       {"rotation_error_deg", {{"median", score.rotation_error_median_deg}, {"p95", score.rotation_error_95_deg}}},
       {"normalized_error2",
        {{"median", score.normalized_error2_median}, {"share_within_95", score.normalized_error2_within_95}}},
-      {"gap_m",
-       {{"p50", score.gap_50_m},
-        {"p90", score.gap_90_m},
-        {"p99", score.gap_99_m},
-        {"max", score.gap_max_m},
-        {"share_within_1_5_m", ShareWithin(score.gaps_m, 1.5)}}}};
+      {"gap_m", GapsJson(score)}};
 }
 
 Json TruePairsJson(const TruePairStatistics& statistics) {
@@ -186,6 +194,11 @@ std::string Number(double value, const char* format) {
   return std::isnan(value) ? "-" : Format(format, value);
 }
 
+std::string FormatGaps(const Score& score) {
+  return "50 % " + Number(score.gap_50_m, "%.1f m") + ", 90 % " + Number(score.gap_90_m, "%.1f m") + ", 99 % " +
+         Number(score.gap_99_m, "%.1f m") + ", longest " + Number(score.gap_max_m, "%.1f m");
+}
+
 std::string FormatScore(const Score& score) {
   std::string text;
   text += Format("closures            %zu true, %zu false, %zu trivial (target too young)\n", score.true_closures,
@@ -202,10 +215,15 @@ std::string FormatScore(const Score& score) {
           "\n";
   text += "covariances         squared errors over them: median " + Number(score.normalized_error2_median, "%.1f") +
           " (honest: 5.3), " + Number(score.normalized_error2_within_95, "%.3f") + " within 12.6 (honest: 0.95)\n";
-  text += "gaps on revisits    50 % " + Number(score.gap_50_m, "%.1f m") + ", 90 % " +
-          Number(score.gap_90_m, "%.1f m") + ", 99 % " + Number(score.gap_99_m, "%.1f m") + ", longest " +
-          Number(score.gap_max_m, "%.1f m") + "\n";
+  text += "gaps on revisits    " + FormatGaps(score) + "\n";
   return text;
+}
+
+// What was accepted at once, where later steps settled something.
+std::string FormatAtOnce(const Score& score, const Score& at_once) {
+  if (score.closures == at_once.closures) return {};
+  return Format("accepted at once    %zu, recall ", at_once.closures) + Number(at_once.recall, "%.3f") + ", gaps " +
+         FormatGaps(at_once) + "\n";
 }
 
 std::string FormatTruePairs(const TruePairStatistics& statistics) {
@@ -245,6 +263,9 @@ std::string SummaryJson(const EvaluationResult& result) {
   json["closures_in_graph"] = result.graph_closures.size();
   json["closures_outvoted"] = result.last_optimization.outvoted_closures;
   json["score"] = result.score ? ScoreJson(*result.score) : Json();
+  json["at_once"] = nullptr;
+  if (const std::optional<Score>& at_once = result.score_at_once)
+    json["at_once"] = {{"closures", at_once->closures}, {"recall", at_once->recall}, {"gap_m", GapsJson(*at_once)}};
   json["trajectory_error_m"] = nullptr;
   if (result.trajectory_error) {
     const TrajectoryErrors& errors = *result.trajectory_error;
@@ -286,9 +307,12 @@ std::string FormatSummary(const EvaluationResult& result) {
       Format("%zu steps of ", result.steps.size()) + result.drive +
       Format(" in %.1f s (%.1f a second)\n", result.seconds, static_cast<double>(result.steps.size()) / result.seconds);
   for (const std::string& note : result.notes) text += "  note: " + note + "\n";
-  text += Format("\nrecognitions        %zu accepted, %zu entered the pose graph, %zu outvoted there\n",
-                 result.closures.size(), result.graph_closures.size(), result.last_optimization.outvoted_closures);
+  const auto settled = std::count_if(result.recognitions.begin(), result.recognitions.end(),
+                                     [](const JudgedRecognition& recognition) { return recognition.settled_by.has_value(); });
+  text += Format("\nrecognitions        %zu accepted, %zu of them settled by later ones, %zu entered the pose graph, %zu outvoted there\n",
+                 result.closures.size(), static_cast<std::size_t>(settled), result.graph_closures.size(), result.last_optimization.outvoted_closures);
   text += result.score ? FormatScore(*result.score) : "no ground truth: nothing is scored\n";
+  if (result.score_at_once) text += FormatAtOnce(*result.score, *result.score_at_once);
   if (result.score) text += FormatTruePairs(MeasureTruePairs(result.true_pairs));
   if (result.trajectory_error) text += FormatErrors(*result.trajectory_error);
   text += "steps ended by     ";

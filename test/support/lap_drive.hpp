@@ -57,11 +57,12 @@ inline PipelineRun Process(const Drive& drive, BackEnd* back_end, const FrontEnd
     Scan scan = drive.scans[i];
     if (i >= moved_from) scan.T_odom_sensor = T_moved_odom * scan.T_odom_sensor;
     BackEndStep step = back_end->Process(front_end.Process(scan).delta);
-    if (step.closure) {
-      const Closure& c = *step.closure;
+    const auto keep = [&run](const Closure& c) {
       run.closures.push_back({c.stamp_query_ns, c.stamp_target_ns, c.robot_query, c.robot_target, c.T_target_query, c.inliers,
                               c.candidates, c.rms_m});
-    }
+    };
+    for (const Closure& closure : step.settled) keep(closure);
+    if (step.closure) keep(*step.closure);
     run.steps.push_back(std::move(step));
   }
   return run;

@@ -62,6 +62,8 @@ TEST(Acceptance, WhereSegmentsDeceiveTheWayAndTheScansDecide) {
   EXPECT_EQ(judge([](Evidence& e) { e.runner_up = 0, e.distinction = 0.0, e.since_twin_m = 50.0; }), Verdict::kAccepted)
       << "no rival now";
   EXPECT_EQ(judge([](Evidence& e) { e.contradiction = 0.07; }), Verdict::kContradicted);
+  EXPECT_EQ(judge([](Evidence& e) { e.distinction = e.track_m = 0.0, e.on_proven_track = true; }), Verdict::kAccepted);
+  EXPECT_EQ(judge([](Evidence& e) { e.contradiction = 0.07, e.on_proven_track = true; }), Verdict::kContradicted);
 }
 
 TEST(Acceptance, StrengthIsTheSmallestFactorByWhichALimitIsKept) {
@@ -76,6 +78,8 @@ TEST(Acceptance, StrengthIsTheSmallestFactorByWhichALimitIsKept) {
   evidence.track_m = 60.0;
   evidence.track_fit = 0.98;
   EXPECT_DOUBLE_EQ(Strength(evidence, parameters), 60.0 / 50.0) << "borne out by the way";
+  evidence.on_proven_track = true;
+  EXPECT_DOUBLE_EQ(Strength(evidence, parameters), 2.0);
   AcceptanceParameters lax;
   lax.min_coverage = lax.twin_memory_m = 0.0;
   EXPECT_EQ(Strength(Evidence(), lax), std::numeric_limits<double>::infinity());
@@ -104,6 +108,7 @@ TEST(Acceptance, StrengthOfOneDividesWhatIsAcceptedFromWhatIsRefused) {
       if (chance(0.1)) evidence.since_twin_m = 2.0 * parameters.twin_memory_m * uniform(random);
       evidence.track_m = 2.0 * parameters.min_track_m * uniform(random);
       evidence.track_fit = chance(0.2) ? parameters.min_track_fit : 0.9 + 0.1 * uniform(random);
+      evidence.on_proven_track = chance(0.1);
       evidence.distinction = chance(0.2) ? parameters.min_distinction : uniform(random);
       evidence.contradiction = around(parameters.max_contradiction);
       evidence.contradiction_once = around(parameters.max_contradiction_once);
