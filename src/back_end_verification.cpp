@@ -45,27 +45,12 @@ const SegmentView& BackEnd::MatchedView(RobotIndex robot, const Correspondence& 
   throw std::logic_error("an inlier is none of the candidates");
 }
 
-/// Lays a recognition on scans, and where there is a rival, the rival as well: what fits better is the recognition. Gathers the
-/// evidence for it and judges that. The step's counts get the evidence and the end, which says whether what comes back is
-/// accepted; with it, what waited for that is settled.
+/// Gathers the evidence for the best hypothesis and judges it. The step's counts get the evidence and the end, which says
+/// whether what comes back is accepted; with it, what waited for that is settled.
 std::optional<BackEnd::Hypothesis> BackEnd::Verify(RobotIndex robot, const std::map<RobotIndex, Correspondences>& by_frame,
                                                    const RecognizerResult& result, BackEndStep* step) {
   const AcceptanceParameters& limits = parameters_.acceptance;
-  std::optional<Hypothesis> best;
-  if (result.recognition) best = LayOnScans(robot, *result.recognition, &step->counts.end);
-  if (result.runner_up && (!best || HasRival(best->closure.evidence, limits))) {
-    StepEnd end;
-    std::optional<Hypothesis> rival = LayOnScans(robot, *result.runner_up, &end);
-    if (rival && (!best || IsBetter(robot, *rival, *best))) std::swap(best, rival);
-    if (best) best->closure.evidence.distinction = rival ? Distinction(*best, *rival) : 1.0;
-  }
-  if (!best || !IsOnProvenTrack(robot, *best)) {
-    std::optional<Hypothesis> along = ContinueTrack(robot, by_frame, result.clique_size);
-    if (along && (!best || IsBetter(robot, *along, *best))) {
-      along->closure.evidence.distinction = best ? Distinction(*along, *best) : 1.0;
-      best = std::move(along);
-    }
-  }
+  std::optional<Hypothesis> best = BestHypothesis(robot, by_frame, result, &step->counts.end);
   if (!best) return std::nullopt;
 
   Closure& closure = best->closure;
@@ -87,6 +72,49 @@ std::optional<BackEnd::Hypothesis> BackEnd::Verify(RobotIndex robot, const std::
   step->counts.evidence = evidence;
   step->counts.end = ToStepEnd(verdict);
   return best;
+}
+
+/// Lays a recognition on scans; where there is a rival, the rival as well; and where neither continues a proven track, what
+/// does. None, and why, if nothing can be laid on scans.
+std::optional<BackEnd::Hypothesis> BackEnd::BestHypothesis(RobotIndex robot,
+                                                           const std::map<RobotIndex, Correspondences>& by_frame,
+                                                           const RecognizerResult& result, StepEnd* end) {
+  std::optional<Hypothesis> best;
+  if (result.recognition) best = LayOnScans(robot, *result.recognition, end);
+  if (result.runner_up && (!best || HasRival(best->closure.evidence, parameters_.acceptance))) {
+    StepEnd end_of_rival;
+    std::optional<Hypothesis> rival = LayOnScans(robot, *result.runner_up, &end_of_rival);
+    if (rival && (!best || IsBetter(robot, *rival, *best))) std::swap(best, rival);
+    if (best) best->closure.evidence.distinction = rival ? Distinction(*best, *rival) : 1.0;
+  }
+  if (!best || !IsOnProvenTrack(robot, *best)) {
+    std::optional<Hypothesis> along = ContinueTrack(robot, by_frame, result.clique_size);
+    if (along && (!best || IsBetter(robot, *along, *best))) {
+      along->closure.evidence.distinction = best ? Distinction(*along, *best) : 1.0;
+      best = std::move(along);
+    }
+  }
+  return best;
+}
+
+/// A recognition as a closure to the key frame there, refined on scans. Nothing, and why, if that can't be.
+std::optional<BackEnd::Hypothesis> BackEnd::LayOnScans(RobotIndex robot, const Recognition& recognition, StepEnd* end) {
+  const std::optional<KeyframeName> target = NearestKeyframe(robot, recognition);
+  if (!target) {
+    *end = StepEnd::kTooYoung;
+    return std::nullopt;
+  }
+  Hypothesis hypothesis{*target, MakeClosure(robot, robots_[robot].stamp_ns, recognition, *target), {}};
+  Evidence& evidence = hypothesis.closure.evidence;
+  evidence.inliers = recognition.inliers.size();
+  evidence.runner_up = recognition.runner_up_size;
+  evidence.since_twin_m = robots_[robot].path_m - robots_[robot].twin_path_m;
+  const bool is_near = hypothesis.closure.T_target_query.translation().norm() <= parameters_.acceptance.max_distance_m;
+  if (parameters_.refinement.enabled && is_near && !Refine(robot, &hypothesis)) {
+    *end = StepEnd::kNotRefined;
+    return std::nullopt;
+  }
+  return hypothesis;
 }
 
 /// The place where a proven track goes on, if enough matches agree there, be it fewer than elsewhere.
@@ -147,26 +175,6 @@ void BackEnd::SettleTrack(RobotIndex robot, const Closure& closure, Verdict verd
     candidate.closure.evidence.on_proven_track = true;  // when it will be accepted
     if (Judge(candidate.closure.evidence, parameters_.acceptance) == Verdict::kAccepted) waiting.push_back(std::move(candidate));
   }
-}
-
-/// A recognition as a closure to the key frame there, refined on scans. Nothing, and why, if that can't be.
-std::optional<BackEnd::Hypothesis> BackEnd::LayOnScans(RobotIndex robot, const Recognition& recognition, StepEnd* end) {
-  const std::optional<KeyframeName> target = NearestKeyframe(robot, recognition);
-  if (!target) {
-    *end = StepEnd::kTooYoung;
-    return std::nullopt;
-  }
-  Hypothesis hypothesis{*target, MakeClosure(robot, robots_[robot].stamp_ns, recognition, *target), {}};
-  Evidence& evidence = hypothesis.closure.evidence;
-  evidence.inliers = recognition.inliers.size();
-  evidence.runner_up = recognition.runner_up_size;
-  evidence.since_twin_m = robots_[robot].path_m - robots_[robot].twin_path_m;
-  const bool is_near = hypothesis.closure.T_target_query.translation().norm() <= parameters_.acceptance.max_distance_m;
-  if (parameters_.refinement.enabled && is_near && !Refine(robot, &hypothesis)) {
-    *end = StepEnd::kNotRefined;
-    return std::nullopt;
-  }
-  return hypothesis;
 }
 
 /// Of the scan's points that lie on something at only one of two places the share that does so at the first. One half where

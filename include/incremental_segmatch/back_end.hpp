@@ -277,6 +277,8 @@ class BackEnd {
   RecognizerResult Recognize(RobotIndex robot, const std::map<RobotIndex, Correspondences>& by_frame);
   std::optional<Hypothesis> Verify(RobotIndex robot, const std::map<RobotIndex, Correspondences>& by_frame,
                                    const RecognizerResult& result, BackEndStep* step);
+  std::optional<Hypothesis> BestHypothesis(RobotIndex robot, const std::map<RobotIndex, Correspondences>& by_frame,
+                                           const RecognizerResult& result, StepEnd* end);
   std::optional<Hypothesis> ContinueTrack(RobotIndex robot, const std::map<RobotIndex, Correspondences>& by_frame,
                                           std::size_t rival_size);
   std::optional<Hypothesis> LayOnScans(RobotIndex robot, const Recognition& recognition, StepEnd* end);

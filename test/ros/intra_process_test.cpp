@@ -6,8 +6,10 @@
 #include <sensor_msgs/PointCloud2.h>
 #include <tf2_ros/transform_broadcaster.h>
 
+#include <algorithm>
 #include <boost/make_shared.hpp>
 #include <cmath>
+#include <functional>
 #include <map>
 #include <string>
 #include <vector>
@@ -83,17 +85,17 @@ TEST_F(IntraProcess, CloudsAndSegmentsArePassedAsPointers) {
   }
 }
 
-TEST_F(IntraProcess, UnderOverloadTheNewestIsKeptAndLatencyIsBounded) {
+TEST_F(IntraProcess, UnderOverloadTheNewestIsKept) {
   // Clouds that take some milliseconds each, published without a pause.
   constexpr int kClouds = 300;
   constexpr int kQueue = 2;
   ros::param::set("/overload/queue_size", kQueue);
   Load("overload");
-  std::vector<std::pair<StampNs, ros::WallTime>> done;
+  std::vector<StampNs> done;
   ros::Subscriber steps =
       nh_.subscribe<StepReport>("/overload/front_end_steps", 1000,
                                 boost::function<void(const StepReportConstPtr&)>([&](const StepReportConstPtr& m) {
-                                  done.emplace_back(ToStampNs(m->header.stamp), ros::WallTime::now());
+                                  done.push_back(ToStampNs(m->header.stamp));
                                 }));
   std::map<std::string, std::string> diagnosed;
   ros::Subscriber diagnostics = nh_.subscribe<diagnostic_msgs::DiagnosticArray>(
@@ -107,7 +109,6 @@ TEST_F(IntraProcess, UnderOverloadTheNewestIsKeptAndLatencyIsBounded) {
   ASSERT_TRUE(WaitFor([&] { return steps.getNumPublishers() > 0 && diagnostics.getNumPublishers() > 0; }));
 
   sensor_msgs::PointCloud2 cloud = drive_.Cloud(0, "lidar");
-  std::vector<ros::WallTime> published;
   const auto stamp_ns = [this](int i) { return drive_.stamp_ns(0) + i * 10000000LL; };
   // Poses first, so that nothing waits for them.
   for (int i = 0; i < kClouds; ++i) PublishTf(0, stamp_ns(i));
@@ -115,15 +116,14 @@ TEST_F(IntraProcess, UnderOverloadTheNewestIsKeptAndLatencyIsBounded) {
   for (int i = 0; i < kClouds; ++i) {
     cloud.header.stamp = ToTime(stamp_ns(i));
     const auto message = boost::make_shared<const sensor_msgs::PointCloud2>(cloud);
-    published.push_back(ros::WallTime::now());
     clouds_.publish(message);
   }
   const StampNs last_ns = stamp_ns(kClouds - 1);
-  ASSERT_TRUE(WaitFor([&] { return !done.empty() && done.back().first == last_ns; }, 20.0))
+  ASSERT_TRUE(WaitFor([&] { return !done.empty() && done.back() == last_ns; }, 20.0))
       << "the newest cloud was not processed";
 
   // Every cloud is either processed or counted as dropped.
-  ASSERT_LT(done.size(), published.size()) << "this machine is too fast for the test: nothing was dropped";
+  ASSERT_LT(done.size(), static_cast<std::size_t>(kClouds)) << "this machine is too fast for the test: nothing was dropped";
   EXPECT_GT(done.size(), 1u);
   const auto number = [&](const char* key) { return diagnosed.count(key) ? std::stoul(diagnosed[key]) : 0ul; };
   ASSERT_TRUE(WaitFor(
@@ -134,14 +134,8 @@ TEST_F(IntraProcess, UnderOverloadTheNewestIsKeptAndLatencyIsBounded) {
       5.0));
   EXPECT_EQ(done.size() + number("scans dropped by the full queue"), static_cast<std::size_t>(kClouds));
 
-  // A cloud that is processed has waited for no more than those in the queue before it.
-  double longest_step_s = 0.0;
-  for (std::size_t i = 1; i < done.size(); ++i)
-    longest_step_s = std::max(longest_step_s, (done[i].second - done[i - 1].second).toSec());
-  for (const auto& [stamp, when] : done) {
-    const auto index = static_cast<std::size_t>((stamp - stamp_ns(0)) / 10000000LL);
-    EXPECT_LE((when - published[index]).toSec(), (2 * kQueue + 3) * longest_step_s + 0.2) << "cloud " << index;
-  }
+  // None waits behind a newer one.
+  EXPECT_EQ(std::adjacent_find(done.begin(), done.end(), std::greater_equal<>()), done.end());
 }
 
 }  // namespace
