@@ -532,8 +532,12 @@ void BackEnd::JoinFrames(RobotIndex robot, RobotIndex target_robot, const Pose& 
 std::size_t BackEnd::memory_bytes() const {
   std::size_t bytes = map_.memory_bytes();
   for (const Submap& submap : submaps_) bytes += submap.target.memory_bytes();
-  for (const Robot& robot : robots_)
+  for (const Robot& robot : robots_) {
     for (const PastScan& scan : robot.history) bytes += scan.image.memory_bytes();
+    for (const Track& track : robot.tracks)
+      for (const Candidate& candidate : track.waiting)
+        bytes += sizeof(Candidate) + candidate.closure.matches.capacity() * sizeof(SegmentMatch);
+  }
   return bytes;
 }
 

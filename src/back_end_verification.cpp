@@ -164,7 +164,11 @@ void BackEnd::SettleTrack(RobotIndex robot, const Closure& closure, Verdict verd
                           std::vector<Closure>* settled) const {
   const double path_m = robots_[robot].path_m;
   std::deque<Candidate>& waiting = track->waiting;
-  while (!waiting.empty() && path_m - waiting.front().path_m > parameters_.history.length_m) waiting.pop_front();
+  constexpr std::size_t kMostWaiting = 1000;  // a robot that stands still goes no way
+  while (!waiting.empty() &&
+         (path_m - waiting.front().path_m > parameters_.history.length_m || waiting.size() >= kMostWaiting)) {
+    waiting.pop_front();
+  }
   if (!waiting.empty() && waiting.back().closure.stamp_query_ns == closure.stamp_query_ns) waiting.pop_back();  // tried again
   if (verdict == Verdict::kAccepted) {
     track->is_proven = true;

@@ -178,7 +178,7 @@ class BackEnd {
   const TargetIndex& targets() const { return index_; }
   /// As given to the constructor, or changed since.
   const BackEndParameters& parameters() const { return parameters_; }
-  /// Memory held, about: the map, scans of the way here, scans prepared for refinement. O(map).
+  /// Memory held, about: the map, scans of the way here, scans prepared for refinement, closures that wait. O(map).
   std::size_t memory_bytes() const;
 
  private:
