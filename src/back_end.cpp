@@ -535,8 +535,8 @@ std::size_t BackEnd::memory_bytes() const {
   for (const Robot& robot : robots_) {
     for (const PastScan& scan : robot.history) bytes += scan.image.memory_bytes();
     for (const Track& track : robot.tracks)
-      for (const Candidate& candidate : track.waiting)
-        bytes += sizeof(Candidate) + candidate.closure.matches.capacity() * sizeof(SegmentMatch);
+      for (const WaitingClosure& kept : track.waiting)
+        bytes += sizeof(WaitingClosure) + kept.closure.matches.capacity() * sizeof(SegmentMatch);
   }
   return bytes;
 }

@@ -163,7 +163,7 @@ bool BackEnd::IsBetter(RobotIndex robot, const Hypothesis& first, const Hypothes
 void BackEnd::SettleTrack(RobotIndex robot, const Closure& closure, Verdict verdict, Track* track,
                           std::vector<Closure>* settled) const {
   const double path_m = robots_[robot].path_m;
-  std::deque<Candidate>& waiting = track->waiting;
+  std::deque<WaitingClosure>& waiting = track->waiting;
   constexpr std::size_t kMostWaiting = 1000;  // a robot that stands still goes no way
   while (!waiting.empty() &&
          (path_m - waiting.front().path_m > parameters_.history.length_m || waiting.size() >= kMostWaiting)) {
@@ -172,12 +172,12 @@ void BackEnd::SettleTrack(RobotIndex robot, const Closure& closure, Verdict verd
   if (!waiting.empty() && waiting.back().closure.stamp_query_ns == closure.stamp_query_ns) waiting.pop_back();  // tried again
   if (verdict == Verdict::kAccepted) {
     track->is_proven = true;
-    for (Candidate& candidate : waiting) settled->push_back(std::move(candidate.closure));
+    for (WaitingClosure& kept : waiting) settled->push_back(std::move(kept.closure));
     waiting.clear();
   } else if (verdict == Verdict::kAmbiguous) {
-    Candidate candidate{path_m, closure};
-    candidate.closure.evidence.on_proven_track = true;  // when it will be accepted
-    if (Judge(candidate.closure.evidence, parameters_.acceptance) == Verdict::kAccepted) waiting.push_back(std::move(candidate));
+    WaitingClosure kept{path_m, closure};
+    kept.closure.evidence.on_proven_track = true;  // when it will be accepted
+    if (Judge(kept.closure.evidence, parameters_.acceptance) == Verdict::kAccepted) waiting.push_back(std::move(kept));
   }
 }
 

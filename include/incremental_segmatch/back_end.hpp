@@ -210,7 +210,7 @@ class BackEnd {
     double value = 0.0;  // its overlap over what could be expected
   };
   // A closure that would be accepted, were it not ambiguous.
-  struct Candidate {
+  struct WaitingClosure {
     double path_m = 0.0;  // of the robot, there
     Closure closure;
   };
@@ -221,7 +221,7 @@ class BackEnd {
     Pose T_odom_sensor;
     std::deque<Fit> fits;  // along the way
     bool is_proven = false;  // one of them was accepted
-    std::deque<Candidate> waiting;  // ambiguous ones, until then
+    std::deque<WaitingClosure> waiting;  // ambiguous ones, until then
   };
   // A place where the robot may be.
   struct Hypothesis {
