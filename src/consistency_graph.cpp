@@ -11,7 +11,7 @@
 #include "radix_sort.hpp"
 
 #if defined(__GNUC__) && defined(__x86_64__)
-#define SEGMATCH_HAS_AVX2_KERNEL
+#define SEGMATCH_HAS_AVX_KERNELS
 #include <immintrin.h>
 #endif
 
@@ -44,11 +44,15 @@ bool IsUsable(const Match& match) {
          (match.target.array().abs() <= kLargestCoordinate_m).all();
 }
 
-double Distance(const Eigen::Vector3d& a, const Eigen::Vector3d& b) {
+double SquaredDistance(const Eigen::Vector3d& a, const Eigen::Vector3d& b) {
   const double x = a.x() - b.x();
   const double y = a.y() - b.y();
   const double z = a.z() - b.z();
-  return std::sqrt(x * x + y * y + z * z);
+  return x * x + y * y + z * z;
+}
+
+double Distance(const Eigen::Vector3d& a, const Eigen::Vector3d& b) {
+  return std::sqrt(SquaredDistance(a, b));
 }
 
 bool ShareSegment(const Match& a, const Match& b) {
@@ -63,8 +67,9 @@ struct Margins {
 };
 
 Margins MarginsOf(const Match& a, const Match& b, double epsilon_m, double max_vertical_slope) {
-  const double d_local = Distance(a.local, b.local);
-  const double d_target = Distance(a.target, b.target);
+  const Eigen::Array2d squares(SquaredDistance(a.local, b.local), SquaredDistance(a.target, b.target));
+  const Eigen::Array2d distances = squares.sqrt();  // both roots at once
+  const double d_local = distances[0], d_target = distances[1];
   const double rise = std::abs((a.local.z() - b.local.z()) - (a.target.z() - b.target.z()));
   // Infinity times a zero distance would be no number.
   const double allowance = max_vertical_slope == kInfinity ? kInfinity : epsilon_m + max_vertical_slope * d_local;
@@ -88,11 +93,14 @@ bool Consistent(const Match& a, const Match& b, double epsilon_m, double max_ver
 /// |d_l - d_t| <= tol because (d_l + d_t)^2 <= 2 (d_l^2 + d_t^2), without a root; their rounding is a factor of
 /// 1 + 8 u on tol. 64 u E and 1 + 2^-16 leave a wide margin to both.
 struct ScreenArrays {
-  std::array<std::vector<float>, 6> coordinates;  ///< local x, y, z, target x, y, z; padded to full vectors
-  float factor = 0.f;                             ///< 2 tol^2
+  static constexpr std::uint32_t kBlock = 16;  ///< matches, one after the other
+  /// A cache line for each of local x, y, z, target x, y, z.
+  struct alignas(64) Block {
+    float coordinates[6][kBlock];
+  };
+  std::vector<Block> blocks;  ///< the last one padded
+  float factor = 0.f;         ///< 2 tol^2
 };
-
-constexpr std::uint32_t kLanes = 8;
 
 struct Bounds {
   Eigen::Vector3d low = Eigen::Vector3d::Constant(kInfinity);
@@ -107,13 +115,13 @@ struct Bounds {
   double largest_coordinate() const { return std::max(low.cwiseAbs().maxCoeff(), high.cwiseAbs().maxCoeff()); }
 };
 
-ScreenArrays MakeScreenArrays(const std::vector<Match>& matches, const Bounds& local, const Bounds& target,
-                              double tolerance_m) {
+void FillScreenArrays(const std::vector<Match>& matches, const Bounds& local, const Bounds& target, double tolerance_m,
+                      ScreenArrays& arrays) {
   constexpr double kFloatRounding = 1.0 / (1 << 24);
   constexpr double kDoubleRounding = 1e-15;
-  ScreenArrays arrays;
-  for (auto& coordinate : arrays.coordinates) coordinate.assign(matches.size() + kLanes, 0.f);
-  if (matches.empty()) return arrays;
+  constexpr std::uint32_t kBlock = ScreenArrays::kBlock;
+  arrays.blocks.resize((matches.size() + kBlock - 1) / kBlock);
+  if (matches.empty()) return;
 
   const double extent = std::max(local.half_extent(), target.half_extent());
   const double rounding_m = 64.0 * kFloatRounding * extent +
@@ -127,12 +135,12 @@ ScreenArrays MakeScreenArrays(const std::vector<Match>& matches, const Bounds& l
   const Eigen::Vector3d local_middle = local.middle();
   const Eigen::Vector3d target_middle = target.middle();
   for (std::size_t i = 0; i < matches.size(); ++i) {
+    auto& coordinates = arrays.blocks[i / kBlock].coordinates;
     for (int axis = 0; axis < 3; ++axis) {
-      arrays.coordinates[axis][i] = static_cast<float>((matches[i].local[axis] - local_middle[axis]) * scale);
-      arrays.coordinates[3 + axis][i] = static_cast<float>((matches[i].target[axis] - target_middle[axis]) * scale);
+      coordinates[axis][i % kBlock] = static_cast<float>((matches[i].local[axis] - local_middle[axis]) * scale);
+      coordinates[3 + axis][i % kBlock] = static_cast<float>((matches[i].target[axis] - target_middle[axis]) * scale);
     }
   }
-  return arrays;
 }
 
 /// Indices begin to end - 1.
@@ -140,97 +148,161 @@ struct Range {
   std::uint32_t begin, end;
 };
 
-/// Writes those in the ranges that may be within the tolerance of i to `hits` and returns their number.
+/// Appends a range to ascending ones; where the last one ends at its begin, they become one.
+void Append(Range range, std::vector<Range>& ranges) {
+  if (range.begin >= range.end) return;
+  if (!ranges.empty() && ranges.back().end == range.begin) {
+    ranges.back().end = range.end;
+  } else {
+    ranges.push_back(range);
+  }
+}
+
+/// Writes those in the ranges that may be within the tolerance of i to `hits`, which has room for two more, and returns
+/// their number.
 std::size_t ScreenPortable(const ScreenArrays& arrays, std::uint32_t i, const std::vector<Range>& ranges,
                            std::uint32_t* hits) {
-  const auto& c = arrays.coordinates;
+  constexpr std::uint32_t kBlock = ScreenArrays::kBlock;
+  std::array<float, 6> own;
+  for (int k = 0; k < 6; ++k) own[k] = arrays.blocks[i / kBlock].coordinates[k][i % kBlock];
+  const auto square = [](float x) { return x * x; };
   std::size_t count = 0;
   for (const Range range : ranges) {
-    for (std::uint32_t j = range.begin; j < range.end; ++j) {
-      const float lx = c[0][j] - c[0][i], ly = c[1][j] - c[1][i], lz = c[2][j] - c[2][i];
-      const float tx = c[3][j] - c[3][i], ty = c[4][j] - c[4][i], tz = c[5][j] - c[5][i];
-      const float local = lx * lx + ly * ly + lz * lz;
-      const float target = tx * tx + ty * ty + tz * tz;
-      const float difference = local - target;
-      hits[count] = j;
-      count += difference * difference <= arrays.factor * (local + target) ? 1 : 0;
+    for (std::uint32_t j = range.begin / kBlock * kBlock; j < range.end; j += kBlock) {
+      const auto& all = arrays.blocks[j / kBlock].coordinates;
+      std::array<float, kBlock> excess;
+      for (std::uint32_t k = 0; k < kBlock; ++k) {
+        const float local = square(own[0] - all[0][k]) + square(own[1] - all[1][k]) + square(own[2] - all[2][k]);
+        const float target = square(own[3] - all[3][k]) + square(own[4] - all[4][k]) + square(own[5] - all[5][k]);
+        excess[k] = square(local - target) - arrays.factor * (local + target);
+      }
+      const std::uint32_t end = std::min(kBlock, range.end - j);
+      for (std::uint32_t k = j < range.begin ? range.begin - j : 0; k < end; ++k) {
+        hits[count] = j + k;
+        count += excess[k] <= 0.f ? 1 : 0;
+      }
     }
   }
   return count;
 }
 
-#ifdef SEGMATCH_HAS_AVX2_KERNEL
+#ifdef SEGMATCH_HAS_AVX_KERNELS
 #define SEGMATCH_AVX2 __attribute__((target("avx2,fma,bmi,popcnt")))
-
-/// What ScreenPortable reads of the matches, from the first on, and of the one that they are compared with.
-struct ScreenOperands {
-  SEGMATCH_AVX2 ScreenOperands(const ScreenArrays& arrays, std::uint32_t i)
-      : lx(arrays.coordinates[0].data()),
-        ly(arrays.coordinates[1].data()),
-        lz(arrays.coordinates[2].data()),
-        tx(arrays.coordinates[3].data()),
-        ty(arrays.coordinates[4].data()),
-        tz(arrays.coordinates[5].data()),
-        lx_i(_mm256_set1_ps(lx[i])),
-        ly_i(_mm256_set1_ps(ly[i])),
-        lz_i(_mm256_set1_ps(lz[i])),
-        tx_i(_mm256_set1_ps(tx[i])),
-        ty_i(_mm256_set1_ps(ty[i])),
-        tz_i(_mm256_set1_ps(tz[i])),
-        factor(_mm256_set1_ps(arrays.factor)) {}
-
-  const float *lx, *ly, *lz, *tx, *ty, *tz;
-  __m256 lx_i, ly_i, lz_i, tx_i, ty_i, tz_i, factor;
-};
-
-/// One bit for each of eight matches from j on.
-SEGMATCH_AVX2 inline std::uint32_t ScreenEight(const ScreenOperands& of, std::uint32_t j) {
-  const __m256 a = _mm256_sub_ps(of.lx_i, _mm256_loadu_ps(of.lx + j));
-  const __m256 b = _mm256_sub_ps(of.ly_i, _mm256_loadu_ps(of.ly + j));
-  const __m256 c = _mm256_sub_ps(of.lz_i, _mm256_loadu_ps(of.lz + j));
-  const __m256 d = _mm256_sub_ps(of.tx_i, _mm256_loadu_ps(of.tx + j));
-  const __m256 e = _mm256_sub_ps(of.ty_i, _mm256_loadu_ps(of.ty + j));
-  const __m256 f = _mm256_sub_ps(of.tz_i, _mm256_loadu_ps(of.tz + j));
-  const __m256 local = _mm256_fmadd_ps(a, a, _mm256_fmadd_ps(b, b, _mm256_mul_ps(c, c)));
-  const __m256 target = _mm256_fmadd_ps(d, d, _mm256_fmadd_ps(e, e, _mm256_mul_ps(f, f)));
-  const __m256 difference = _mm256_sub_ps(local, target);
-  const __m256 near = _mm256_cmp_ps(_mm256_mul_ps(difference, difference),
-                                    _mm256_mul_ps(of.factor, _mm256_add_ps(local, target)), _CMP_LE_OQ);
-  return static_cast<std::uint32_t>(_mm256_movemask_ps(near));
-}
+#define SEGMATCH_AVX512 __attribute__((target("avx512f,bmi,popcnt")))
 
 /// Appends j + k for each bit k of the mask and returns the new count. Most masks have at most two bits, but which ones
 /// have any is anybody's guess: without a branch for that, nothing is guessed wrongly.
-SEGMATCH_AVX2 inline std::size_t AppendBits(std::uint32_t mask, std::uint32_t j, std::uint32_t* hits,
-                                            std::size_t count) {
-  const auto bits = static_cast<std::size_t>(_mm_popcnt_u32(mask));
-  hits[count] = j + _tzcnt_u32(mask);
-  mask = _blsr_u32(mask);
-  hits[count + 1] = j + _tzcnt_u32(mask);
+__attribute__((target("bmi,popcnt"))) inline std::size_t AppendBits(std::uint64_t mask, std::uint32_t j,
+                                                                    std::uint32_t* hits, std::size_t count) {
+  const auto bits = static_cast<std::size_t>(_mm_popcnt_u64(mask));
+  hits[count] = j + static_cast<std::uint32_t>(_tzcnt_u64(mask));
+  mask = _blsr_u64(mask);
+  hits[count + 1] = j + static_cast<std::uint32_t>(_tzcnt_u64(mask));
   for (std::size_t k = 2; k < bits; ++k) {
-    mask = _blsr_u32(mask);
-    hits[count + k] = j + _tzcnt_u32(mask);
+    mask = _blsr_u64(mask);
+    hits[count + k] = j + static_cast<std::uint32_t>(_tzcnt_u64(mask));
   }
   return count + bits;
 }
 
-/// The same as ScreenPortable, thirty-two at a time, and the rest of a range eight at a time.
+/// The match that others are compared with, eight times over.
+struct Own256 {
+  SEGMATCH_AVX2 Own256(const ScreenArrays& arrays, std::uint32_t i) : factor(_mm256_set1_ps(arrays.factor)) {
+    const auto& own = arrays.blocks[i / ScreenArrays::kBlock].coordinates;
+    for (int k = 0; k < 6; ++k) coordinates[k] = _mm256_set1_ps(own[k][i % ScreenArrays::kBlock]);
+  }
+  __m256 coordinates[6];
+  __m256 factor;
+};
+
+/// One bit for each of the eight matches in a half of the block.
+SEGMATCH_AVX2 inline std::uint64_t ScreenHalf(const Own256& own, const ScreenArrays::Block& block, int half) {
+  const auto difference = [&](int k) SEGMATCH_AVX2 {
+    return _mm256_sub_ps(own.coordinates[k], _mm256_load_ps(block.coordinates[k] + 8 * half));
+  };
+  const __m256 lx = difference(0), ly = difference(1), lz = difference(2);
+  const __m256 tx = difference(3), ty = difference(4), tz = difference(5);
+  const __m256 local = _mm256_fmadd_ps(lx, lx, _mm256_fmadd_ps(ly, ly, _mm256_mul_ps(lz, lz)));
+  const __m256 target = _mm256_fmadd_ps(tx, tx, _mm256_fmadd_ps(ty, ty, _mm256_mul_ps(tz, tz)));
+  const __m256 off = _mm256_sub_ps(local, target);
+  const __m256 near =
+      _mm256_cmp_ps(_mm256_mul_ps(off, off), _mm256_mul_ps(own.factor, _mm256_add_ps(local, target)), _CMP_LE_OQ);
+  return static_cast<std::uint32_t>(_mm256_movemask_ps(near));
+}
+
+SEGMATCH_AVX2 inline std::uint64_t ScreenBlock(const Own256& own, const ScreenArrays::Block& block) {
+  return ScreenHalf(own, block, 0) | ScreenHalf(own, block, 1) << 8;
+}
+
+/// The same, sixteen times over.
+struct Own512 {
+  SEGMATCH_AVX512 Own512(const ScreenArrays& arrays, std::uint32_t i) : factor(_mm512_set1_ps(arrays.factor)) {
+    const auto& own = arrays.blocks[i / ScreenArrays::kBlock].coordinates;
+    for (int k = 0; k < 6; ++k) coordinates[k] = _mm512_set1_ps(own[k][i % ScreenArrays::kBlock]);
+  }
+  __m512 coordinates[6];
+  __m512 factor;
+};
+
+/// One bit for each of the matches of the block.
+SEGMATCH_AVX512 inline std::uint64_t ScreenBlock(const Own512& own, const ScreenArrays::Block& block) {
+  const auto difference = [&](int k) SEGMATCH_AVX512 {
+    return _mm512_sub_ps(own.coordinates[k], _mm512_load_ps(block.coordinates[k]));
+  };
+  const __m512 lx = difference(0), ly = difference(1), lz = difference(2);
+  const __m512 tx = difference(3), ty = difference(4), tz = difference(5);
+  const __m512 local = _mm512_fmadd_ps(lx, lx, _mm512_fmadd_ps(ly, ly, _mm512_mul_ps(lz, lz)));
+  const __m512 target = _mm512_fmadd_ps(tx, tx, _mm512_fmadd_ps(ty, ty, _mm512_mul_ps(tz, tz)));
+  const __m512 off = _mm512_sub_ps(local, target);
+  return _mm512_cmp_ps_mask(_mm512_mul_ps(off, off), _mm512_mul_ps(own.factor, _mm512_add_ps(local, target)),
+                            _CMP_LE_OQ);
+}
+
+/// The same as ScreenPortable, four blocks at a time, and the rest of a range one at a time.
 SEGMATCH_AVX2 std::size_t ScreenAvx2(const ScreenArrays& arrays, std::uint32_t i, const std::vector<Range>& ranges,
                                      std::uint32_t* hits) {
-  const ScreenOperands of(arrays, i);
+  constexpr std::uint32_t kBlock = ScreenArrays::kBlock;
+  const Own256 own(arrays, i);
   std::size_t count = 0;
   for (const Range range : ranges) {
-    std::uint32_t j = range.begin;
-    for (; j + 4 * kLanes <= range.end; j += 4 * kLanes) {
-      const std::uint32_t mask = ScreenEight(of, j) | ScreenEight(of, j + kLanes) << kLanes |
-                                 ScreenEight(of, j + 2 * kLanes) << 2 * kLanes |
-                                 ScreenEight(of, j + 3 * kLanes) << 3 * kLanes;
-      count = AppendBits(mask, j, hits, count);
+    std::uint32_t j = range.begin / kBlock * kBlock;
+    std::uint64_t valid = ~std::uint64_t{0} << (range.begin - j);
+    for (; j + 4 * kBlock <= range.end; j += 4 * kBlock) {
+      const ScreenArrays::Block* const block = &arrays.blocks[j / kBlock];
+      const std::uint64_t mask = ScreenBlock(own, block[0]) | ScreenBlock(own, block[1]) << kBlock |
+                                 ScreenBlock(own, block[2]) << 2 * kBlock | ScreenBlock(own, block[3]) << 3 * kBlock;
+      count = AppendBits(mask & valid, j, hits, count);
+      valid = ~std::uint64_t{0};
     }
-    for (; j < range.end; j += kLanes) {
-      std::uint32_t mask = ScreenEight(of, j);
-      if (range.end - j < kLanes) mask &= (1u << (range.end - j)) - 1u;
-      count = AppendBits(mask, j, hits, count);
+    for (; j < range.end; j += kBlock) {
+      if (range.end - j < kBlock) valid &= (std::uint64_t{1} << (range.end - j)) - 1;
+      count = AppendBits(ScreenBlock(own, arrays.blocks[j / kBlock]) & valid, j, hits, count);
+      valid = ~std::uint64_t{0};
+    }
+  }
+  return count;
+}
+
+/// The same as ScreenPortable, four blocks at a time, and the rest of a range one at a time.
+SEGMATCH_AVX512 std::size_t ScreenAvx512(const ScreenArrays& arrays, std::uint32_t i, const std::vector<Range>& ranges,
+                                         std::uint32_t* hits) {
+  constexpr std::uint32_t kBlock = ScreenArrays::kBlock;
+  const Own512 own(arrays, i);
+  std::size_t count = 0;
+  for (const Range range : ranges) {
+    std::uint32_t j = range.begin / kBlock * kBlock;
+    std::uint64_t valid = ~std::uint64_t{0} << (range.begin - j);
+    for (; j + 4 * kBlock <= range.end; j += 4 * kBlock) {
+      const ScreenArrays::Block* const block = &arrays.blocks[j / kBlock];
+      const std::uint64_t mask = ScreenBlock(own, block[0]) | ScreenBlock(own, block[1]) << kBlock |
+                                 ScreenBlock(own, block[2]) << 2 * kBlock | ScreenBlock(own, block[3]) << 3 * kBlock;
+      count = AppendBits(mask & valid, j, hits, count);
+      valid = ~std::uint64_t{0};
+    }
+    for (; j < range.end; j += kBlock) {
+      if (range.end - j < kBlock) valid &= (std::uint64_t{1} << (range.end - j)) - 1;
+      count = AppendBits(ScreenBlock(own, arrays.blocks[j / kBlock]) & valid, j, hits, count);
+      valid = ~std::uint64_t{0};
     }
   }
   return count;
@@ -239,14 +311,18 @@ SEGMATCH_AVX2 std::size_t ScreenAvx2(const ScreenArrays& arrays, std::uint32_t i
 
 using ScreenFunction = std::size_t (*)(const ScreenArrays&, std::uint32_t, const std::vector<Range>&, std::uint32_t*);
 
-ScreenFunction ChooseScreen(bool use_avx2) {
-#ifdef SEGMATCH_HAS_AVX2_KERNEL
-  if (use_avx2 && __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi") &&
+ScreenFunction ChooseScreen(Instructions instructions) {
+#ifdef SEGMATCH_HAS_AVX_KERNELS
+  if (instructions >= Instructions::kAvx512 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("bmi") &&
       __builtin_cpu_supports("popcnt")) {
+    return ScreenAvx512;
+  }
+  if (instructions >= Instructions::kAvx2 && __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
+      __builtin_cpu_supports("bmi") && __builtin_cpu_supports("popcnt")) {
     return ScreenAvx2;
   }
 #endif
-  (void)use_avx2;
+  (void)instructions;
   return ScreenPortable;
 }
 
@@ -255,15 +331,19 @@ ScreenFunction ChooseScreen(bool use_avx2) {
 
 enum class Layout { kOneCell, kSquares, kCubes };
 
-/// Matches sorted into cells over the target centroids: rows of squares along x, so that all squares of a row within
-/// reach are one contiguous range. Finds, for a match, those others for which |d_l - d_t| may be within the tolerance.
+/// Matches sorted into cells over the target centroids: rows along x, divided into columns, so that all columns of a
+/// row within reach are one contiguous range. Finds, for a match, those others for which |d_l - d_t| may be within the
+/// tolerance. Memory is kept from one list of matches to the next.
 class Partition {
  public:
-  Partition(const std::vector<Match>& matches, double tolerance_m, Layout layout, bool use_avx2);
+  explicit Partition(Instructions instructions) : screen_(ChooseScreen(instructions)) {}
+
+  /// Replaces what the partition holds.
+  void Assign(const std::vector<Match>& matches, double tolerance_m, Layout layout);
 
   std::size_t size() const { return matches_.size(); }
   const Match& match(std::uint32_t slot) const { return matches_[slot]; }
-  /// Index of the match in the list given to the constructor.
+  /// Index of the match in the list that was assigned.
   std::uint32_t index(std::uint32_t slot) const { return order_[slot]; }
 
   /// Calls visit(slot, slot) once for each unordered pair that passes the screen; returns the number of pairs screened.
@@ -289,25 +369,29 @@ class Partition {
     int dy, dz;
   };
 
-  static constexpr int kReach = 4;  ///< squares of side b + tolerance, divided by this
+  static constexpr int kReach = 2;    ///< rows to a square of side b + tolerance
+  static constexpr int kColumns = 8;  ///< columns to the height of a row
 
-  Index Cell(double offset_m) const { return static_cast<Index>(std::max(offset_m, 0.0) * cells_per_m_); }
-  static std::uint64_t RowKey(Index y, Index z) {
-    return (static_cast<std::uint64_t>(z) << 32) | static_cast<std::uint64_t>(y);
+  Index RowAt(double offset_m) const { return static_cast<Index>(std::max(offset_m, 0.0) * rows_per_m_); }
+  Index ColumnAt(double offset_m) const {
+    return static_cast<Index>(std::max(offset_m, 0.0) * (kColumns * rows_per_m_)) >> column_shift_;
+  }
+  static std::uint64_t Packed(Index high, Index low) {
+    return (static_cast<std::uint64_t>(high) << 32) | static_cast<std::uint64_t>(low);
   }
   void SortIntoRows(const std::vector<Match>& matches);
-  void FillColumns(const std::vector<std::uint64_t>& column_of);
+  void FillColumns(const std::vector<Index>& column_of);
   std::vector<NearRow> RowsNear(const Row& row, bool only_later) const;
   double Gap(Index cell, int step, double offset_m) const;
   Range RangeIn(const NearRow& near, const Row& own, std::uint32_t slot) const;
   template <typename Visit>
   std::uint64_t Screen(std::uint32_t slot, const std::vector<Range>& ranges, Visit& visit);
 
-  Layout layout_;
   ScreenFunction screen_;
+  Layout layout_ = Layout::kOneCell;
   double slack_m_ = 0.0;  ///< covers the rounding of the grid's arithmetic
-  double side_m_ = 1.0;
-  double cells_per_m_ = 1.0;
+  double side_m_ = 1.0;   ///< height of a row
+  double rows_per_m_ = 1.0;
   int column_shift_ = 0;  ///< columns are 2^shift cells wide, so that tables stay small however far targets lie apart
   Eigen::Vector3d origin_ = Eigen::Vector3d::Zero();
   std::vector<std::uint32_t> order_;         ///< slot to index
@@ -319,8 +403,14 @@ class Partition {
   std::vector<std::uint32_t> hits_;
 };
 
-Partition::Partition(const std::vector<Match>& matches, double tolerance_m, Layout layout, bool use_avx2)
-    : layout_(layout), screen_(ChooseScreen(use_avx2)) {
+void Partition::Assign(const std::vector<Match>& matches, double tolerance_m, Layout layout) {
+  layout_ = layout;
+  column_shift_ = 0;
+  order_.clear();
+  matches_.clear();
+  reach_m_.clear();
+  rows_.clear();
+  column_begin_.clear();
   Bounds local, target;
   for (const Match& match : matches) {
     local.Add(match.local);
@@ -334,48 +424,51 @@ Partition::Partition(const std::vector<Match>& matches, double tolerance_m, Layo
     double farthest_m = 0.0;
     for (const Match& match : matches) farthest_m = std::max(farthest_m, Distance(match.local, middle));
     side_m_ = (2.0 * farthest_m + tolerance_m + 8.0 * slack_m_) * (1.0 + 1e-9) / kReach;
-    side_m_ = std::max(side_m_, target.half_extent() / (1 << 28));
-    cells_per_m_ = 1.0 / side_m_;
+    side_m_ = std::max(side_m_, target.half_extent() / (1 << 24));
+    rows_per_m_ = 1.0 / side_m_;
     SortIntoRows(matches);
     reach_m_.reserve(matches_.size());
     for (const Match& match : matches_) {
       reach_m_.push_back(Distance(match.local, middle) + farthest_m + tolerance_m + 4.0 * slack_m_);
     }
   }
-  arrays_ = MakeScreenArrays(matches_, local, target, tolerance_m);
-  hits_.resize(matches_.size() + kLanes);
+  FillScreenArrays(matches_, local, target, tolerance_m, arrays_);
+  hits_.resize(matches_.size() + 2);
 }
 
 void Partition::SortIntoRows(const std::vector<Match>& matches) {
   order_.resize(matches.size());
   for (std::uint32_t i = 0; i < order_.size(); ++i) order_[i] = i;
-  std::vector<std::uint64_t> row_of(matches.size(), 0), column_of(matches.size(), 0);
+  std::vector<std::uint64_t> level_of(matches.size(), 0), cell_of(matches.size(), 0);
   if (layout_ != Layout::kOneCell) {
     for (std::size_t i = 0; i < matches.size(); ++i) {
       const Eigen::Vector3d offset = matches[i].target - origin_;
-      column_of[i] = static_cast<std::uint64_t>(Cell(offset.x()));
-      row_of[i] = RowKey(Cell(offset.y()), layout_ == Layout::kCubes ? Cell(offset.z()) : 0);
+      cell_of[i] = Packed(RowAt(offset.y()), ColumnAt(offset.x()));
+      level_of[i] = layout_ == Layout::kCubes ? static_cast<std::uint64_t>(RowAt(offset.z())) : 0;
     }
-    order_ = SortedByKeys(std::move(order_), row_of, column_of);
+    order_ = SortedByKeys(std::move(order_), level_of, cell_of);
   }
   matches_.reserve(matches.size());
   for (const std::uint32_t i : order_) matches_.push_back(matches[i]);
 
+  std::vector<Index> column_of;  // by slot
+  column_of.reserve(order_.size());
   for (std::uint32_t slot = 0; slot < order_.size(); ++slot) {
-    const std::uint64_t key = row_of[order_[slot]];
-    const auto column = static_cast<Index>(column_of[order_[slot]]);
-    if (rows_.empty() || RowKey(rows_.back().y, rows_.back().z) != key) {
-      rows_.push_back({static_cast<Index>(key & 0xffffffffu), static_cast<Index>(key >> 32), slot, slot, column, 0, 0});
+    const auto z = static_cast<Index>(level_of[order_[slot]]);
+    const auto y = static_cast<Index>(cell_of[order_[slot]] >> 32);
+    column_of.push_back(static_cast<Index>(cell_of[order_[slot]] & 0xffffffffu));
+    if (rows_.empty() || rows_.back().y != y || rows_.back().z != z) {
+      rows_.push_back({y, z, slot, slot, column_of.back(), 0, 0});
     }
     rows_.back().end = slot + 1;
-    rows_.back().last_column = column;
+    rows_.back().last_column = column_of.back();
   }
   FillColumns(column_of);
 }
 
-void Partition::FillColumns(const std::vector<std::uint64_t>& column_of) {
+void Partition::FillColumns(const std::vector<Index>& column_of) {
   const std::size_t limit = 8 * order_.size() + 4096;
-  for (column_shift_ = 0;; ++column_shift_) {
+  for (;; ++column_shift_) {
     std::size_t total = 0;
     for (const Row& row : rows_) {
       total += static_cast<std::size_t>((row.last_column >> column_shift_) - (row.first_column >> column_shift_)) + 2;
@@ -387,7 +480,7 @@ void Partition::FillColumns(const std::vector<std::uint64_t>& column_of) {
     row.last_column >>= column_shift_;
     row.table = column_begin_.size();
     for (std::uint32_t slot = row.begin; slot < row.end; ++slot) {
-      const Index column = static_cast<Index>(column_of[order_[slot]]) >> column_shift_;
+      const Index column = column_of[slot] >> column_shift_;
       const std::size_t needed = row.table + static_cast<std::size_t>(column - row.first_column) + 1;
       if (column_begin_.size() < needed) column_begin_.resize(needed, slot);
     }
@@ -402,10 +495,10 @@ std::vector<Partition::NearRow> Partition::RowsNear(const Row& row, bool only_la
   for (int dz = only_later ? 0 : -reach_z; dz <= reach_z; ++dz) {
     for (int dy = only_later && dz == 0 ? 0 : -reach_y; dy <= reach_y; ++dy) {
       if (row.z + dz < 0 || row.y + dy < 0) continue;
-      const std::uint64_t key = RowKey(row.y + dy, row.z + dz);
+      const std::uint64_t key = Packed(row.z + dz, row.y + dy);
       const auto found = std::lower_bound(rows_.begin(), rows_.end(), key,
-                                          [](const Row& a, std::uint64_t b) { return RowKey(a.y, a.z) < b; });
-      if (found != rows_.end() && RowKey(found->y, found->z) == key) near.push_back({&*found, dy, dz});
+                                          [](const Row& a, std::uint64_t b) { return Packed(a.z, a.y) < b; });
+      if (found != rows_.end() && Packed(found->z, found->y) == key) near.push_back({&*found, dy, dz});
     }
   }
   return near;
@@ -429,8 +522,8 @@ Range Partition::RangeIn(const NearRow& near, const Row& own, std::uint32_t slot
   if (width_sq < 0.0) return {0, 0};
   const double width = std::sqrt(width_sq) + slack_m_;
   const double x = target.x() - origin_.x();
-  const Index low = std::max(Cell(x - width) >> column_shift_, row.first_column);
-  const Index high = std::min(Cell(x + width) >> column_shift_, row.last_column);
+  const Index low = std::max(ColumnAt(x - width), row.first_column);
+  const Index high = std::min(ColumnAt(x + width), row.last_column);
   if (low > high) return {0, 0};
   const std::uint32_t* const table = column_begin_.data() + row.table - row.first_column;
   return {table[low], table[high + 1]};
@@ -456,7 +549,7 @@ std::uint64_t Partition::ForEachPair(Visit visit) {
       for (const NearRow& near : rows_near) {
         Range range = RangeIn(near, row, slot);
         if (near.row == &row) range.begin = slot + 1;  // those before it have visited it
-        if (range.begin < range.end) ranges.push_back(range);
+        Append(range, ranges);
       }
       screened += Screen(slot, ranges, visit);
     }
@@ -473,7 +566,7 @@ std::uint64_t Partition::ForEachPairOf(Selected selected, Visit visit) {
     for (std::uint32_t slot = row.begin; slot < row.end; ++slot) {
       if (!selected(slot)) continue;
       ranges.clear();
-      for (const NearRow& near : rows_near) ranges.push_back(RangeIn(near, row, slot));
+      for (const NearRow& near : rows_near) Append(RangeIn(near, row, slot), ranges);
       screened += Screen(slot, ranges, visit);
     }
   }
@@ -486,7 +579,8 @@ std::uint64_t Partition::ForEachPairOf(Selected selected, Visit visit) {
 /// Remembers, per correspondence, which others may be consistent with it until one of the two has drifted too far.
 class Cache {
  public:
-  explicit Cache(const ConsistencyParameters& parameters) : parameters_(parameters) {}
+  explicit Cache(const ConsistencyParameters& parameters)
+      : parameters_(parameters), partition_(parameters.instructions) {}
 
   ConsistencyGraph Build(const Correspondences& correspondences);
 
@@ -525,6 +619,7 @@ class Cache {
   std::vector<State> states_;          ///< by track
   std::vector<std::uint32_t> free_;    ///< tracks without a correspondence
   std::vector<std::uint32_t> sorted_;  ///< tracks in use, by key
+  Partition partition_;                ///< of the anchors
   std::uint64_t tested_pairs_ = 0;
 };
 
@@ -654,15 +749,15 @@ void Cache::FindNewCandidates(std::vector<ConsistencyGraph::Edge>& edges) {
   if (!any_new) return;
   constexpr double kRounding_m = 1e-6;
   const double tolerance_m = parameters_.cache_theta_m + parameters_.epsilon_m + kRounding_m;
-  Partition partition(anchors, tolerance_m, Layout::kSquares, parameters_.use_avx2);
-  const auto is_new = [&](std::uint32_t slot) { return states_[sorted_[partition.index(slot)]].is_new == 1; };
-  tested_pairs_ += partition.ForEachPairOf(is_new, [&](std::uint32_t slot, std::uint32_t other_slot) {
+  partition_.Assign(anchors, tolerance_m, Layout::kSquares);
+  const auto is_new = [&](std::uint32_t slot) { return states_[sorted_[partition_.index(slot)]].is_new == 1; };
+  tested_pairs_ += partition_.ForEachPairOf(is_new, [&](std::uint32_t slot, std::uint32_t other_slot) {
     if (other_slot == slot || (other_slot > slot && is_new(other_slot))) return;  // new pairs once
-    const Match& own = partition.match(slot);
-    const Match& other = partition.match(other_slot);
+    const Match& own = partition_.match(slot);
+    const Match& other = partition_.match(other_slot);
     if (ShareSegment(own, other)) return;
-    const std::uint32_t index = sorted_[partition.index(slot)];
-    const std::uint32_t other_index = sorted_[partition.index(other_slot)];
+    const std::uint32_t index = sorted_[partition_.index(slot)];
+    const std::uint32_t other_index = sorted_[partition_.index(other_slot)];
     Candidate candidate{other_index, states_[other_index].generation, 0, 0.0};
     Test(own, 0.0, candidate);
     if (candidate.consistent) edges.emplace_back(states_[index].vertex, states_[other_index].vertex);
@@ -771,7 +866,8 @@ bool AreConsistent(const Correspondence& a, const Correspondence& b, double epsi
 
 class ConsistencyGraphBuilder::Impl {
  public:
-  explicit Impl(const ConsistencyParameters& parameters) : parameters_(parameters), cache_(parameters) {}
+  explicit Impl(const ConsistencyParameters& parameters)
+      : parameters_(parameters), partition_(parameters.instructions), cache_(parameters) {}
 
   ConsistencyGraph Build(const Correspondences& correspondences) {
     return parameters_.method == ConsistencyMethod::kAuto ? BuildWithFastest(correspondences)
@@ -792,25 +888,23 @@ class ConsistencyGraphBuilder::Impl {
     }
   }
 
-  ConsistencyGraph BuildPartitioned(const Correspondences& correspondences, Layout layout) const {
-    std::vector<Match> matches;
-    std::vector<std::uint32_t> vertices;
-    matches.reserve(correspondences.size());
-    vertices.reserve(correspondences.size());
+  ConsistencyGraph BuildPartitioned(const Correspondences& correspondences, Layout layout) {
+    matches_.clear();
+    vertices_.clear();
     for (std::uint32_t v = 0; v < correspondences.size(); ++v) {
       const Match match = MakeMatch(correspondences[v]);
       if (!IsUsable(match)) continue;
-      matches.push_back(match);
-      vertices.push_back(v);
+      matches_.push_back(match);
+      vertices_.push_back(v);
     }
-    std::vector<ConsistencyGraph::Edge> edges;
-    Partition partition(matches, parameters_.epsilon_m, layout, parameters_.use_avx2);
-    const std::uint64_t tested = partition.ForEachPair([&](std::uint32_t a, std::uint32_t b) {
-      if (Consistent(partition.match(a), partition.match(b), parameters_.epsilon_m, parameters_.max_vertical_slope)) {
-        edges.emplace_back(vertices[partition.index(a)], vertices[partition.index(b)]);
+    partition_.Assign(matches_, parameters_.epsilon_m, layout);
+    edges_.clear();
+    const std::uint64_t tested = partition_.ForEachPair([&](std::uint32_t a, std::uint32_t b) {
+      if (Consistent(partition_.match(a), partition_.match(b), parameters_.epsilon_m, parameters_.max_vertical_slope)) {
+        edges_.emplace_back(vertices_[partition_.index(a)], vertices_[partition_.index(b)]);
       }
     });
-    ConsistencyGraph graph = ConsistencyGraph::FromEdges(correspondences.size(), edges);
+    ConsistencyGraph graph = ConsistencyGraph::FromEdges(correspondences.size(), edges_);
     graph.tested_pairs = tested;
     return graph;
   }
@@ -818,6 +912,10 @@ class ConsistencyGraphBuilder::Impl {
   ConsistencyGraph BuildWithFastest(const Correspondences& correspondences);
 
   ConsistencyParameters parameters_;
+  std::vector<Match> matches_;           ///< of the last call, as what follows: memory that the next one reuses
+  std::vector<std::uint32_t> vertices_;  ///< of the matches
+  std::vector<ConsistencyGraph::Edge> edges_;
+  Partition partition_;
   Cache cache_;
   MethodChooser chooser_;
 };

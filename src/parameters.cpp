@@ -70,6 +70,13 @@ const EnumNames<ConsistencyMethod>& NamesOf(ConsistencyMethod) {
   return names;
 }
 
+const EnumNames<Instructions>& NamesOf(Instructions) {
+  static const EnumNames<Instructions> names{{Instructions::kPortable, "portable"},
+                                             {Instructions::kAvx2, "avx2"},
+                                             {Instructions::kAvx512, "avx512"}};
+  return names;
+}
+
 template <class T>
 struct IsArray : std::false_type {};
 template <class T, std::size_t N>
@@ -380,8 +387,8 @@ const std::vector<Parameter>& Table() {
              "by how much the height difference of two segments may differ, over their distance and beyond epsilon; at "
              "least "
              "`max_tilt_rad`"),
-      CHOICE(back_end.recognizer.consistency.use_avx2,
-             "use AVX2 on processors that have it; the edges are the same without"),
+      CHOICE(back_end.recognizer.consistency.instructions,
+             "the best ones used, on processors that have them; the edges are the same with all"),
 
       NUMBER(back_end.recognizer.clique.min_size, AtLeast(3), "fewer consistent pairs of segments are no recognition"),
       NUMBER(back_end.recognizer.clique.max_work, AtLeast(1),

@@ -19,14 +19,12 @@ inline std::vector<std::uint32_t> SortedByKey(std::vector<std::uint32_t> order,
     std::uint64_t key;
     std::uint32_t index;
   };
-  if (order.empty()) return order;
+  std::uint64_t varying_bits = 0;
+  for (const std::uint32_t i : order) varying_bits |= keys[i] ^ keys[order.front()];
+  if (varying_bits == 0) return order;
   std::vector<Entry> entries, sorted(order.size());
   entries.reserve(order.size());
-  std::uint64_t varying_bits = 0;
-  for (const std::uint32_t i : order) {
-    entries.push_back({keys[i], i});
-    varying_bits |= keys[i] ^ entries.front().key;
-  }
+  for (const std::uint32_t i : order) entries.push_back({keys[i], i});
   for (int shift = 0; shift < 64; shift += 8) {
     if (((varying_bits >> shift) & 0xff) == 0) continue;
     std::array<std::uint32_t, 256> begin{};

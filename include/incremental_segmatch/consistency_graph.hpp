@@ -57,6 +57,13 @@ enum class ConsistencyMethod {
   kAuto            ///< whichever of the others measured fastest in the last calls
 };
 
+/// The best instructions that are used, on processors that have them.
+enum class Instructions {
+  kPortable,  ///< none beyond those of every processor
+  kAvx2,      ///< eight floats at a time
+  kAvx512     ///< sixteen
+};
+
 /// When two correspondences agree, and how that is found out.
 struct ConsistencyParameters {
   double epsilon_m = 0.4;                                        ///< tolerance of (2.3), > 0
@@ -65,7 +72,7 @@ struct ConsistencyParameters {
   /// Both maps have z roughly along gravity: the height difference of a pair may differ between the maps by at most
   /// epsilon plus this slope (metres per metre of the pair's distance; a tilt in radians suffices). Infinity: no limit.
   double max_vertical_slope = 0.1;
-  bool use_avx2 = true;  ///< on processors that have it; the edges are the same without
+  Instructions instructions = Instructions::kAvx512;  ///< the edges are the same with all of them
 };
 
 /// The predicate that decides on every edge, in double precision: true if the pair shares neither a local nor a target
@@ -79,9 +86,9 @@ bool AreConsistent(const Correspondence& a, const Correspondence& b, double epsi
 /// Every method returns the same edges, those for which AreConsistent holds.
 ///
 /// Squares: the grid has squares of side b + epsilon, b an upper bound of the 3-D distance between any two local
-/// centroids, each divided into four by four; a correspondence looks only as far as its own local centroid is from the
-/// farthest other one. Pairs are screened in single precision, relative to the middle of each map, with a tolerance
-/// widened by the rounding that the maps' extents allow; the predicate decides on what remains.
+/// centroids, each divided into two rows of sixteen columns; a correspondence looks only as far as its own local
+/// centroid is from the farthest other one. Pairs are screened in single precision, relative to the middle of each map,
+/// with a tolerance widened by the rounding that the maps' extents allow; the predicate decides on what remains.
 ///
 /// Cache: a correspondence (by the keys of both segments) keeps those candidates for which |d_l - d_t| between the
 /// anchors, where both were when they were cached, is at most theta + epsilon. It is cached anew once the drifts of its

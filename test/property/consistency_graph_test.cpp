@@ -193,7 +193,9 @@ TEST(ConsistencyGraph, EveryMethodGivesTheEdgesOfTheDefinition) {
       ConsistencyParameters parameters = sequence.parameters();
       parameters.method = method;
       builders.emplace(name, parameters);
-      parameters.use_avx2 = false;
+      parameters.instructions = Instructions::kAvx2;
+      builders.emplace(name + ", AVX2", parameters);
+      parameters.instructions = Instructions::kPortable;
       builders.emplace(name + ", portable", parameters);
     }
     for (int step = 0; step < 8; ++step) {
