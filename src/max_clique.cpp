@@ -1,17 +1,27 @@
 #include "incremental_segmatch/max_clique.hpp"
 
 #include <algorithm>
+#include <array>
 #include <iterator>
 #include <limits>
+#include <numeric>
 #include <optional>
 #include <stdexcept>
 #include <utility>
+
+// Compiled for processors that count bits in one instruction as well, and chosen at run time; the results are the same.
+#if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__gnu_linux__)
+#define SEGMATCH_SEVERAL_TARGETS __attribute__((target_clones("popcnt", "default")))
+#else
+#define SEGMATCH_SEVERAL_TARGETS
+#endif
 
 namespace incremental_segmatch {
 namespace {
 
 using Word = std::uint64_t;
 using Vertices = std::vector<std::uint32_t>;
+using Edges = std::vector<ConsistencyGraph::Edge>;
 using Clock = std::chrono::steady_clock;
 
 constexpr std::size_t kWordBits = 64;
@@ -27,6 +37,9 @@ void Clear(Word* bits, std::size_t i) {
 }
 std::size_t LowestBit(Word word) {
   return static_cast<std::size_t>(__builtin_ctzll(word));
+}
+inline std::size_t CountBits(Word word) {
+  return static_cast<std::size_t>(__builtin_popcountll(word));
 }
 
 /// Degeneracy order by bucket sort (Batagelj and Zaversnik): each vertex has at most core[v] neighbours after it.
@@ -194,7 +207,7 @@ bool Search::Recolour(std::size_t vertex, std::size_t classes) {
     for (std::size_t k = 0; k < words_ && neighbours < 2; ++k) {
       const Word common = class_a[k] & row[k];
       if (common == 0) continue;
-      neighbours += static_cast<std::size_t>(__builtin_popcountll(common));
+      neighbours += CountBits(common);
       only = k * kWordBits + LowestBit(common);
     }
     effort_.Spend(words_);
@@ -237,95 +250,180 @@ void Search::Expand(Word* candidates) {
   }
 }
 
-/// Which vertices are in the core of this order: they have as many neighbours among each other.
-std::vector<bool> InCore(const ConsistencyGraph& graph, std::size_t order) {
-  std::vector<bool> in_core(graph.vertices(), true);
-  Vertices degree(graph.vertices()), leaving;
+/// A subgraph; its vertices are renumbered in their order.
+struct NamedGraph {
+  ConsistencyGraph graph;
+  Vertices names;  ///< of the vertices: their numbers in the whole graph
+};
+
+/// The subgraph of the vertices for which keep(v), and their numbers in the whole graph.
+template <typename Keep>
+NamedGraph Subgraph(const ConsistencyGraph& graph, Keep keep) {
+  constexpr std::uint32_t kDropped = std::numeric_limits<std::uint32_t>::max();
+  Vertices new_index(graph.vertices(), kDropped);
+  Vertices names;
+  std::size_t most_neighbours = 0;
   for (std::uint32_t v = 0; v < graph.vertices(); ++v) {
-    degree[v] = static_cast<std::uint32_t>(graph.Neighbours(v).size());
-    if (degree[v] >= order) continue;
-    in_core[v] = false;
-    leaving.push_back(v);
+    if (!keep(v)) continue;
+    new_index[v] = static_cast<std::uint32_t>(names.size());
+    names.push_back(v);
+    most_neighbours += graph.Neighbours(v).size();
   }
+  ConsistencyGraph subgraph;
+  subgraph.offsets.reserve(names.size() + 1);
+  subgraph.neighbours.resize(most_neighbours);
+  std::size_t count = 0;
+  for (const std::uint32_t v : names) {
+    for (const std::uint32_t u : graph.Neighbours(v)) {
+      subgraph.neighbours[count] = new_index[u];
+      count += new_index[u] != kDropped ? 1 : 0;
+    }
+    subgraph.offsets.push_back(count);
+  }
+  subgraph.neighbours.resize(count);
+  subgraph.edges = count / 2;
+  return {std::move(subgraph), std::move(names)};
+}
+
+/// The core of some order: each of its vertices has as many neighbours among them.
+NamedGraph CoreOf(const ConsistencyGraph& whole, std::size_t order) {
+  // Most vertices of a sparse graph have too low a degree: without them the rest is cheap.
+  NamedGraph core = Subgraph(whole, [&](std::uint32_t v) { return whole.Neighbours(v).size() >= order; });
+  Vertices degree, leaving;
+  for (std::uint32_t v = 0; v < core.graph.vertices(); ++v) {
+    degree.push_back(static_cast<std::uint32_t>(core.graph.Neighbours(v).size()));
+    if (degree[v] < order) leaving.push_back(v);
+  }
+  if (leaving.empty()) return core;
   while (!leaving.empty()) {
     const std::uint32_t v = leaving.back();
     leaving.pop_back();
-    for (const std::uint32_t u : graph.Neighbours(v)) {
-      if (degree[u]-- != order) continue;  // below it already, or not yet
-      in_core[u] = false;
-      leaving.push_back(u);
+    for (const std::uint32_t u : core.graph.Neighbours(v)) {
+      if (degree[u]-- == order) leaving.push_back(u);  // not if it is on its way already
     }
   }
-  return in_core;
+  NamedGraph inner = Subgraph(core.graph, [&](std::uint32_t v) { return degree[v] >= order; });
+  for (std::uint32_t& name : inner.names) name = core.names[name];
+  return inner;
+}
+
+/// The neighbours of each vertex, folded into one cache line: neighbour u sets bit u modulo its size. Bits that two
+/// sketches have in common, and the hidden neighbours of one of the two, bound the common neighbours.
+struct Sketches {
+  using Bits = std::array<Word, 8>;
+  static constexpr std::size_t kBits = std::tuple_size<Bits>::value * kWordBits;
+
+  std::vector<Bits> bits;
+  Vertices hidden;  ///< neighbours whose bit another one of the same vertex had set
+
+  std::size_t MostInCommon(std::uint32_t a, std::uint32_t b) const {
+    std::size_t common = std::min(hidden[a], hidden[b]);
+    for (std::size_t w = 0; w < bits[a].size(); ++w) common += CountBits(bits[a][w] & bits[b][w]);
+    return common;
+  }
+};
+
+SEGMATCH_SEVERAL_TARGETS
+Sketches SketchesOf(const ConsistencyGraph& graph) {
+  Sketches sketches;
+  sketches.bits.reserve(graph.vertices());
+  sketches.hidden.reserve(graph.vertices());
+  for (std::uint32_t v = 0; v < graph.vertices(); ++v) {
+    Sketches::Bits bits{};
+    for (const std::uint32_t u : graph.Neighbours(v)) Set(bits.data(), u % Sketches::kBits);
+    std::size_t set = 0;
+    for (const Word word : bits) set += CountBits(word);
+    sketches.bits.push_back(bits);
+    sketches.hidden.push_back(static_cast<std::uint32_t>(graph.Neighbours(v).size() - set));
+  }
+  return sketches;
+}
+
+/// Neighbours with a larger number.
+ConsistencyGraph::Range LaterNeighbours(const ConsistencyGraph& graph, std::uint32_t v) {
+  const ConsistencyGraph::Range all = graph.Neighbours(v);
+  return {std::upper_bound(all.begin(), all.end(), v), all.end()};
+}
+
+/// The edges whose ends have, by the sketches, at least `common` neighbours in common.
+SEGMATCH_SEVERAL_TARGETS
+Edges EdgesByBound(const ConsistencyGraph& graph, const Sketches& sketches, std::size_t common) {
+  Edges edges;
+  for (std::uint32_t v = 0; v < graph.vertices(); ++v) {
+    for (const std::uint32_t u : LaterNeighbours(graph, v))
+      if (sketches.MostInCommon(v, u) >= common) edges.emplace_back(v, u);
+  }
+  return edges;
+}
+
+/// Drops those edges, sorted, whose ends have fewer than `common` neighbours in common.
+void DropByCount(const ConsistencyGraph& graph, std::size_t common, Edges* edges) {
+  std::vector<std::uint8_t> marked(graph.vertices(), 0);
+  const auto has_common = [&](std::uint32_t vertex) {
+    std::size_t count = 0;
+    for (const std::uint32_t u : graph.Neighbours(vertex)) {
+      count += marked[u];
+      if (count == common) return true;
+    }
+    return false;
+  };
+  auto kept = edges->begin();
+  for (auto edge = edges->begin(); edge != edges->end();) {
+    const std::uint32_t v = edge->first;
+    for (const std::uint32_t u : graph.Neighbours(v)) marked[u] = 1;
+    for (; edge != edges->end() && edge->first == v; ++edge)
+      if (has_common(edge->second)) *kept++ = *edge;
+    for (const std::uint32_t u : graph.Neighbours(v)) marked[u] = 0;
+  }
+  edges->erase(kept, edges->end());
+}
+
+/// Whether it takes too long to look at the neighbours of an end of each edge.
+bool IsTooDense(const ConsistencyGraph& graph) {
+  constexpr std::uint64_t kMostStepsPerEdge = 64;
+  std::uint64_t steps = 0;
+  for (std::uint32_t v = 0; v < graph.vertices(); ++v) {
+    const std::uint64_t later = LaterNeighbours(graph, v).size();
+    steps += later * (graph.Neighbours(v).size() - later);
+  }
+  return steps > kMostStepsPerEdge * graph.edges;
 }
 
 /// Without the edges that are in no clique of `size` vertices because an end is in no core of that order, or for lack
-/// of triangles with others (a truss remains). One pass, O(sum over edges of the neighbours of an end); nothing where
-/// that is too much, or where no edge goes.
-std::optional<ConsistencyGraph> WithoutUnsupportedEdges(const ConsistencyGraph& graph, std::size_t size) {
-  constexpr std::uint64_t kMostStepsPerEdge = 64;
-  const std::vector<bool> in_core = InCore(graph, size - 1);
-  std::vector<std::size_t> begin{0};  // of each vertex's neighbours with a larger number
-  Vertices later;
-  later.reserve(graph.edges);
-  for (std::uint32_t v = 0; v < graph.vertices(); ++v) {
-    if (in_core[v]) {
-      const ConsistencyGraph::Range all = graph.Neighbours(v);
-      for (const std::uint32_t* u = std::upper_bound(all.begin(), all.end(), v); u != all.end(); ++u)
-        if (in_core[*u]) later.push_back(*u);
-    }
-    begin.push_back(later.size());
-  }
-  std::uint64_t steps = 0;
-  for (const std::uint32_t u : later) steps += begin[u + 1] - begin[u];
-  if (steps > kMostStepsPerEdge * later.size()) return std::nullopt;
+/// of triangles with others (a truss remains), most of them known by their sketches. One pass, O(sum over edges of the
+/// neighbours of an end); nothing where that is too much, or where no edge goes.
+std::optional<NamedGraph> WithoutUnsupportedEdges(const ConsistencyGraph& graph, std::size_t size) {
+  const NamedGraph core = CoreOf(graph, size - 1);
+  if (IsTooDense(core.graph)) return std::nullopt;
+  Edges edges = EdgesByBound(core.graph, SketchesOf(core.graph), size - 2);
+  DropByCount(core.graph, size - 2, &edges);
+  if (edges.size() == graph.edges) return std::nullopt;
 
-  Vertices triangles(later.size(), 0);
-  Vertices place(graph.vertices(), 0);  // one more than where the edge to this vertex stands; 0: no edge
-  for (std::uint32_t v = 0; v < graph.vertices(); ++v) {
-    for (std::size_t e = begin[v]; e < begin[v + 1]; ++e) place[later[e]] = static_cast<std::uint32_t>(e + 1);
-    for (std::size_t e = begin[v]; e < begin[v + 1]; ++e) {
-      for (std::size_t f = begin[later[e]]; f < begin[later[e] + 1]; ++f) {
-        const std::uint32_t third = place[later[f]];
-        if (third == 0) continue;
-        ++triangles[e];
-        ++triangles[f];
-        ++triangles[third - 1];
-      }
-    }
-    for (std::size_t e = begin[v]; e < begin[v + 1]; ++e) place[later[e]] = 0;
+  NamedGraph kept;
+  Vertices new_index(core.graph.vertices(), 0);
+  for (const auto& [a, b] : edges) new_index[a] = new_index[b] = 1;
+  for (std::uint32_t v = 0; v < core.graph.vertices(); ++v) {
+    if (new_index[v] == 0) continue;
+    new_index[v] = static_cast<std::uint32_t>(kept.names.size());
+    kept.names.push_back(core.names[v]);
   }
-  std::vector<ConsistencyGraph::Edge> kept;
-  for (std::uint32_t v = 0; v < graph.vertices(); ++v) {
-    for (std::size_t e = begin[v]; e < begin[v + 1]; ++e) {
-      if (triangles[e] + 2 >= size) kept.emplace_back(v, later[e]);
-    }
+  for (auto& [a, b] : edges) {
+    a = new_index[a];
+    b = new_index[b];
   }
-  if (kept.size() == graph.edges) return std::nullopt;
-  return ConsistencyGraph::FromEdges(graph.vertices(), kept);
-}
-
-/// The same again and again, as long as it pays: all cliques of at least `size` vertices are left.
-ConsistencyGraph Reduced(const ConsistencyGraph& graph, std::size_t size) {
-  std::optional<ConsistencyGraph> reduced = WithoutUnsupportedEdges(graph, size);
-  if (!reduced) return graph;
-  for (std::size_t before = graph.edges; reduced->edges > 0 && 4 * reduced->edges < 3 * before;) {
-    before = reduced->edges;
-    std::optional<ConsistencyGraph> further = WithoutUnsupportedEdges(*reduced, size);
-    if (!further) break;
-    reduced = std::move(further);
-  }
-  return std::move(*reduced);
+  kept.graph = ConsistencyGraph::FromEdges(kept.names.size(), edges);
+  return kept;
 }
 
 /// The vertices of a graph that are in a core of some order, renumbered in degeneracy order.
 class CoreGraph {
  public:
   CoreGraph() = default;
-  CoreGraph(const ConsistencyGraph& whole, std::size_t min_core);
+  /// The vertices go by their names in the whole graph.
+  CoreGraph(const ConsistencyGraph& whole, const Vertices& names, std::size_t min_core);
 
   std::size_t size() const { return names_.size(); }
-  std::uint32_t name(std::uint32_t v) const { return names_[v]; }  ///< in the original graph
+  std::uint32_t name(std::uint32_t v) const { return names_[v]; }
   std::size_t core(std::uint32_t v) const { return core_[v]; }
   ConsistencyGraph::Range Neighbours(std::uint32_t v) const {
     return {neighbours_.data() + offsets_[v], neighbours_.data() + offsets_[v + 1]};
@@ -343,29 +441,7 @@ class CoreGraph {
   Vertices neighbours_;
 };
 
-/// The subgraph of the vertices for which keep(v), and their numbers in the whole graph.
-template <typename Keep>
-std::pair<ConsistencyGraph, Vertices> Subgraph(const ConsistencyGraph& graph, Keep keep) {
-  constexpr std::uint32_t kDropped = std::numeric_limits<std::uint32_t>::max();
-  Vertices new_index(graph.vertices(), kDropped);
-  Vertices names;
-  for (std::uint32_t v = 0; v < graph.vertices(); ++v) {
-    if (!keep(v)) continue;
-    new_index[v] = static_cast<std::uint32_t>(names.size());
-    names.push_back(v);
-  }
-  ConsistencyGraph subgraph;
-  for (const std::uint32_t v : names) {
-    for (const std::uint32_t u : graph.Neighbours(v)) {
-      if (new_index[u] != kDropped) subgraph.neighbours.push_back(new_index[u]);
-    }
-    subgraph.offsets.push_back(subgraph.neighbours.size());
-  }
-  subgraph.edges = subgraph.neighbours.size() / 2;
-  return {std::move(subgraph), std::move(names)};
-}
-
-CoreGraph::CoreGraph(const ConsistencyGraph& whole, std::size_t min_core) {
+CoreGraph::CoreGraph(const ConsistencyGraph& whole, const Vertices& names, std::size_t min_core) {
   // Most vertices of a sparse graph have too low a degree: without them the rest is cheap.
   const auto [graph, whole_name] =
       Subgraph(whole, [&](std::uint32_t v) { return whole.Neighbours(v).size() >= min_core; });
@@ -377,7 +453,7 @@ CoreGraph::CoreGraph(const ConsistencyGraph& whole, std::size_t min_core) {
     if (degeneracy.core[v] < min_core) continue;
     new_index[v] = static_cast<std::uint32_t>(ordered.size());
     ordered.push_back(v);
-    names_.push_back(whole_name[v]);
+    names_.push_back(names[whole_name[v]]);
     core_.push_back(degeneracy.core[v]);
   }
   for (const std::uint32_t v : ordered) {
@@ -401,8 +477,11 @@ class Finder {
       : parameters_(parameters),
         better_(better),
         effort_(parameters.max_work, Clock::now() + parameters.deadline),
-        reduced_(graph),
-        floor_(parameters.min_size - 1) {}
+        remaining_(&graph),
+        names_(graph.vertices()),
+        floor_(parameters.min_size - 1) {
+    std::iota(names_.begin(), names_.end(), 0);
+  }
 
   MaxCliqueResult Find();
 
@@ -419,11 +498,13 @@ class Finder {
 
   const MaxCliqueParameters& parameters_;
   const CliqueOrder& better_;
-  Effort effort_;             ///< of the search for the maximum
-  ConsistencyGraph reduced_;  ///< the given one, without what can't matter any more
-  CoreGraph graph_;           ///< of it
-  Vertices best_;             ///< incumbent in the original graph, sorted
-  std::size_t floor_;         ///< only larger cliques are looked for
+  Effort effort_;                      ///< of the search for the maximum
+  const ConsistencyGraph* remaining_;  ///< the given graph, or the reduced one
+  ConsistencyGraph reduced_;           ///< without what can't matter any more
+  Vertices names_;                     ///< of the remaining vertices: their numbers in the given graph
+  CoreGraph graph_;                    ///< of the remaining one
+  Vertices best_;                      ///< incumbent in the original graph, sorted
+  std::size_t floor_;                  ///< only larger cliques are looked for
   MaxCliqueResult result_;
   BitGraph bits_;
   Vertices local_index_;  ///< scratch, all 0 between uses: one more than the index in the bit graph
@@ -440,38 +521,52 @@ Vertices Finder::Named(const Vertices& clique) const {
 /// candidate of the highest degree, again and again.
 void Finder::GrowGreedily() {
   constexpr std::size_t kStarts = 16;
-  const auto before = [this](std::uint32_t a, std::uint32_t b) {
-    const std::size_t degree_a = reduced_.Neighbours(a).size(), degree_b = reduced_.Neighbours(b).size();
-    return degree_a > degree_b || (degree_a == degree_b && a < b);
-  };
-  Vertices starts(reduced_.vertices());
-  for (std::uint32_t v = 0; v < starts.size(); ++v) starts[v] = v;
+  const ConsistencyGraph& graph = *remaining_;
+  Vertices degree, starts(graph.vertices());
+  degree.reserve(graph.vertices());
+  for (std::uint32_t v = 0; v < graph.vertices(); ++v)
+    degree.push_back(static_cast<std::uint32_t>(graph.Neighbours(v).size()));
+  std::iota(starts.begin(), starts.end(), 0);
   const std::size_t count = std::min(kStarts, starts.size());
-  std::partial_sort(starts.begin(), starts.begin() + static_cast<std::ptrdiff_t>(count), starts.end(), before);
+  std::partial_sort(
+      starts.begin(), starts.begin() + static_cast<std::ptrdiff_t>(count), starts.end(),
+      [&](std::uint32_t a, std::uint32_t b) { return degree[a] > degree[b] || (degree[a] == degree[b] && a < b); });
   starts.resize(count);
+  Vertices candidates, common;
   for (const std::uint32_t start : starts) {
-    if (reduced_.Neighbours(start).size() < floor_ || effort_.IsExhausted()) return;
-    Vertices candidates(reduced_.Neighbours(start).begin(), reduced_.Neighbours(start).end());
+    if (degree[start] < floor_ || effort_.IsExhausted()) return;
+    candidates.assign(graph.Neighbours(start).begin(), graph.Neighbours(start).end());
     Vertices clique{start};
     while (!candidates.empty() && clique.size() + candidates.size() > floor_) {
-      clique.push_back(*std::min_element(candidates.begin(), candidates.end(), before));
-      const ConsistencyGraph::Range all = reduced_.Neighbours(clique.back());
+      clique.push_back(*std::max_element(candidates.begin(), candidates.end(),
+                                         [&](std::uint32_t a, std::uint32_t b) { return degree[a] < degree[b]; }));
+      const ConsistencyGraph::Range all = graph.Neighbours(clique.back());
       effort_.Spend(candidates.size() + all.size());
-      Vertices common;
+      common.clear();
       std::set_intersection(candidates.begin(), candidates.end(), all.begin(), all.end(), std::back_inserter(common));
       candidates.swap(common);
     }
     if (!candidates.empty() || clique.size() <= floor_) continue;
     floor_ = clique.size();
+    for (std::uint32_t& v : clique) v = names_[v];
     std::sort(clique.begin(), clique.end());
     best_ = std::move(clique);
   }
 }
 
-/// Drops what is in no clique of at least `size` vertices.
+/// Drops what is in no clique of at least `size` vertices, again and again as long as it pays.
 void Finder::KeepCliquesOf(std::size_t size) {
-  reduced_ = Reduced(reduced_, size);
-  graph_ = CoreGraph(reduced_, size - 1);
+  for (bool pays = true; pays;) {
+    const std::size_t before = remaining_->edges;
+    std::optional<NamedGraph> kept = WithoutUnsupportedEdges(*remaining_, size);
+    if (!kept) break;
+    for (std::uint32_t& name : kept->names) name = names_[name];
+    names_ = std::move(kept->names);
+    reduced_ = std::move(kept->graph);
+    remaining_ = &reduced_;
+    pays = reduced_.edges > 0 && 4 * reduced_.edges < 3 * before;
+  }
+  graph_ = CoreGraph(*remaining_, names_, size - 1);
   local_index_.resize(graph_.size(), 0);
 }
 

@@ -126,20 +126,23 @@ class SmallerResidual {
 
 /// The graph without some of its vertices, which keep their numbers but lose their edges.
 ConsistencyGraph Without(const ConsistencyGraph& graph, const Vertices& removed) {
-  std::vector<bool> is_removed(graph.vertices(), false);
-  for (const std::uint32_t v : removed) is_removed[v] = true;
+  std::vector<std::uint8_t> stays(graph.vertices(), 1);
+  for (const std::uint32_t v : removed) stays[v] = 0;
   ConsistencyGraph rest;
   rest.offsets.reserve(graph.offsets.size());
-  rest.neighbours.reserve(graph.neighbours.size());
+  rest.neighbours.resize(graph.neighbours.size());
+  std::size_t count = 0;
   for (std::uint32_t v = 0; v < graph.vertices(); ++v) {
-    if (!is_removed[v]) {
+    if (stays[v]) {
       for (const std::uint32_t u : graph.Neighbours(v)) {
-        if (!is_removed[u]) rest.neighbours.push_back(u);
+        rest.neighbours[count] = u;
+        count += stays[u];
       }
     }
-    rest.offsets.push_back(rest.neighbours.size());
+    rest.offsets.push_back(count);
   }
-  rest.edges = rest.neighbours.size() / 2;
+  rest.neighbours.resize(count);
+  rest.edges = count / 2;
   return rest;
 }
 

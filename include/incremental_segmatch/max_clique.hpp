@@ -39,9 +39,10 @@ using CliqueOrder = std::function<bool(const std::vector<std::uint32_t>&, const 
 /// lexicographically smallest list.
 ///
 /// A first incumbent is grown greedily around the vertices of the highest degrees. What is in no larger clique, because
-/// a vertex is in no core of that order or an edge in too few triangles (trusses, Cohen), is dropped. Vertices that are
-/// left are visited in degeneracy order (bucket sort, Batagelj and Zaversnik); each one's later neighbourhood is
-/// searched by branch and bound on bit sets with greedy colouring and recolouring as bound (after Tomita et al., MCS).
+/// a vertex is in no core of that order or an edge in too few triangles (trusses, Cohen; of most such edges a bound on
+/// bits tells it), is dropped. Vertices that are left are visited in degeneracy order (bucket sort, Batagelj and
+/// Zaversnik); each one's later neighbourhood is searched by branch and bound on bit sets with greedy colouring and
+/// recolouring as bound (after Tomita et al., MCS).
 /// A second pass, only when the size is proven, looks through the cliques of that size for the best of them.
 ///
 /// Deterministic for a given labelling of the vertices unless the deadline passes before max_work is spent. Where

@@ -181,6 +181,32 @@ TEST(MaxClique, FindsPlantedCliques) {
   }
 }
 
+// Neighbours 512 apart fall on the same bit of a sketch: cliques of such vertices, among edges by chance.
+TEST(MaxClique, SketchesLoseNoCliqueOfVerticesOnTheSameBits) {
+  constexpr std::uint32_t kSketchBits = 512;
+  for (unsigned seed = 0; seed < 60; ++seed) {
+    SCOPED_TRACE("seed " + std::to_string(seed));
+    std::mt19937 random(seed);
+    const std::uint32_t n = 3 * kSketchBits + random() % 100;
+    Edges edges = RandomEdges(n, 0.002 * (1 + random() % 6), random);
+    Vertices members;
+    for (std::size_t bits = 2 + random() % 3; members.size() < 3 * bits;) {
+      const std::uint32_t bit = random() % kSketchBits;
+      for (std::uint32_t turn = 0; turn < 3; ++turn) members.push_back(bit + turn * kSketchBits);
+    }
+    std::sort(members.begin(), members.end());
+    members.erase(std::unique(members.begin(), members.end()), members.end());
+    Plant(members, edges);
+    const ConsistencyGraph graph = ConsistencyGraph::FromEdges(n, edges);
+    Vertices all(n);
+    std::iota(all.begin(), all.end(), 0);
+    const MaxCliqueResult result = FindMaxClique(graph, Parameters(3 + random() % 4));
+    EXPECT_TRUE(result.proven_maximum);
+    EXPECT_TRUE(IsClique(graph, result.vertices));
+    EXPECT_EQ(result.vertices.size(), LargestSize(graph, all, 0, 0));
+  }
+}
+
 // Graphs where the bound is tight, with the sizes that plain colouring, without recolouring, finds: a bound that is one
 // too low loses the largest clique of one of them.
 TEST(MaxClique, KnownSizesOfDenseGraphs) {
