@@ -185,10 +185,20 @@ class BatchBaseline::Impl {
     return recognition;
   }
 
-  BatchSegment Describe(std::vector<std::int32_t> cluster) const {
-    SegmentMoments moments;
-    for (const std::int32_t index : cluster) moments.Add((*cloud_)[index].getVector3fMap().cast<double>());
-    return {std::move(cluster), moments.Centroid(), describer_.Describe(moments, Eigen::Vector3d::UnitZ())};
+  std::vector<BatchSegment> Describe(BatchClusters clusters) const {
+    std::vector<SegmentMoments> moments(clusters.size());
+    Surroundings surroundings;
+    for (std::size_t i = 0; i < clusters.size(); ++i) {
+      for (const std::int32_t index : clusters[i]) moments[i].Add((*cloud_)[index].getVector3fMap().cast<double>());
+      surroundings.push_back(&moments[i]);
+    }
+    std::vector<BatchSegment> segments;
+    segments.reserve(clusters.size());
+    for (std::size_t i = 0; i < clusters.size(); ++i) {
+      Descriptor descriptor = describer_.Describe(moments[i], Eigen::Vector3d::UnitZ(), surroundings);
+      segments.push_back({std::move(clusters[i]), moments[i].Centroid(), std::move(descriptor)});
+    }
+    return segments;
   }
 
   const BatchBaselineParameters& parameters() const { return parameters_; }
@@ -237,8 +247,7 @@ BatchStep BatchBaseline::Process(const Points& obstacles_sensor, const Pose& T_o
     clusters = ClusterEuclidean();
   }
   timer.Lap("segmentation");
-  step.segments.reserve(clusters.size());
-  for (std::vector<std::int32_t>& cluster : clusters) step.segments.push_back(impl_->Describe(std::move(cluster)));
+  step.segments = impl_->Describe(std::move(clusters));
   timer.Lap("description");
   step.voxels = size();
   step.times = timer.Take();

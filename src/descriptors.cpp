@@ -39,6 +39,25 @@ Eigen::Matrix<float, 7, 1> EigenvalueFeatures(const Eigen::Vector3d& ascending_e
   return features.cast<float>();
 }
 
+Eigen::Matrix<float, kContextRings, 1> ContextFeatures(const SegmentMoments& segment, const Surroundings& surroundings,
+                                                       double radius_m) {
+  const Eigen::Vector3d center = segment.Centroid();
+  const double rings_per_m = static_cast<double>(kContextRings) / radius_m;
+  // One ring more, which takes what fades out.
+  Eigen::Matrix<double, kContextRings + 1, 1> heights = Eigen::Matrix<double, kContextRings + 1, 1>::Zero();
+  for (const SegmentMoments* other : surroundings) {
+    if (other == &segment) continue;
+    const double at = (other->Centroid() - center).norm() * rings_per_m;
+    if (!(at < static_cast<double>(kContextRings))) continue;
+    const auto ring = static_cast<Eigen::Index>(at);
+    const double share = at - static_cast<double>(ring);
+    const double height = other->max_z() - other->min_z();
+    heights[ring] += (1.0 - share) * height;
+    heights[ring + 1] += share * height;
+  }
+  return heights.head<kContextRings>().cwiseSqrt().cast<float>();
+}
+
 Describer::Describer(const DescriptorParameters& parameters, double resolution_m)
     : parameters_(parameters), resolution_m_(resolution_m) {
   if (!(resolution_m > 0.0) || !std::isfinite(resolution_m)) {
@@ -53,12 +72,20 @@ Describer::Describer(const DescriptorParameters& parameters, double resolution_m
     names_.insert(names_.end(), {"log_size_1", "log_size_2", "log_size_3", "log_height", "log_count"});
   }
   if (parameters.orientation) names_.insert(names_.end(), {"upright_1", "upright_3"});
+  if (parameters.context) {
+    for (Eigen::Index ring = 1; ring <= kContextRings; ++ring) names_.push_back("context_" + std::to_string(ring));
+  }
+  if (!(parameters.context_radius_m > 0.0) || !std::isfinite(parameters.context_radius_m)) {
+    throw std::invalid_argument("descriptor: context_radius_m is " + std::to_string(parameters.context_radius_m) +
+                                "; it must be positive and finite");
+  }
   if (names_.empty()) {
-    throw std::invalid_argument("descriptor: no feature is selected; switch on eigenvalues, sizes or orientation");
+    throw std::invalid_argument("descriptor: no feature is selected; switch on eigenvalues, sizes, orientation or context");
   }
 }
 
-Descriptor Describer::Describe(const SegmentMoments& moments, const Eigen::Vector3d& up_grid) const {
+Descriptor Describer::Describe(const SegmentMoments& moments, const Eigen::Vector3d& up_grid,
+                               const Surroundings& surroundings) const {
   const Solver solver = Decompose(moments.Covariance());
   const Eigen::Vector3d eigenvalues = solver.eigenvalues().cwiseMax(0.0);
   Descriptor descriptor(size());
@@ -79,6 +106,8 @@ Descriptor Describer::Describe(const SegmentMoments& moments, const Eigen::Vecto
     descriptor[at++] = has_axes ? static_cast<float>(std::abs(solver.eigenvectors().col(2).dot(up_grid))) : 0.f;
     descriptor[at++] = has_axes ? static_cast<float>(std::abs(solver.eigenvectors().col(0).dot(up_grid))) : 0.f;
   }
+  if (parameters_.context)
+    descriptor.segment<kContextRings>(at) = ContextFeatures(moments, surroundings, parameters_.context_radius_m);
   return descriptor;
 }
 

@@ -168,21 +168,30 @@ SegmentDelta FrontEnd::DescribeChanges(const SegmentUpdate& left, const SegmentU
     std::sort(changed.begin(), changed.end());
   }
   delta.changed.reserve(changed.size());
+  const Surroundings surroundings = AllSegments();
   for (const SegmentId segment : changed) {
-    SegmentState state = DescribeSegment(segment);
+    SegmentState state = DescribeSegment(segment, surroundings);
     state.new_view = IsNewView(state);
     delta.changed.push_back(std::move(state));
   }
   return delta;
 }
 
-SegmentState FrontEnd::DescribeSegment(SegmentId segment) const {
+/// What the context of a segment is made of.
+Surroundings FrontEnd::AllSegments() const {
+  Surroundings all;
+  for (const SegmentId segment : segmenter_->Segments()) all.push_back(&segmenter_->Moments(segment));
+  return all;
+}
+
+SegmentState FrontEnd::DescribeSegment(SegmentId segment, const Surroundings& surroundings) const {
   const SegmentMoments& moments = segmenter_->Moments(segment);
   SegmentState state;
   state.id = segment;
   state.size = static_cast<std::uint32_t>(moments.count());
   state.centroid_odom = grid_.T_odom_grid() * moments.Centroid();
-  state.descriptor = describer_.Describe(moments, grid_.T_odom_grid().linear().transpose() * Eigen::Vector3d::UnitZ());
+  const Eigen::Vector3d up_grid = grid_.T_odom_grid().linear().transpose() * Eigen::Vector3d::UnitZ();
+  state.descriptor = describer_.Describe(moments, up_grid, surroundings);
   return state;
 }
 
@@ -232,8 +241,9 @@ SegmentDelta FrontEnd::EmptyDelta() const {
 SegmentDelta FrontEnd::FullState() const {
   SegmentDelta delta = EmptyDelta();
   delta.full_state = true;
+  const Surroundings surroundings = AllSegments();
   for (const SegmentId segment : segmenter_->Segments()) {
-    SegmentState state = DescribeSegment(segment);
+    SegmentState state = DescribeSegment(segment, surroundings);
     state.new_view = true;
     delta.changed.push_back(std::move(state));
   }

@@ -327,6 +327,8 @@ const std::vector<Parameter>& Table() {
       CHOICE(front_end.descriptor.sizes,
              "logarithms of the sizes along the principal axes and gravity, and of the count"),
       CHOICE(front_end.descriptor.orientation, "how upright the principal axes are"),
+      CHOICE(front_end.descriptor.context, "what stands around the segment: heights of the others, by distance"),
+      NUMBER(front_end.descriptor.context_radius_m, Above(0), "`context`: of these surroundings"),
 
       NUMBER(front_end.view.growth_factor, Above(1),
              "a segment gets a new view once it has grown by this factor since its last"),
@@ -510,10 +512,10 @@ const std::vector<Relation>& Relations() {
        [](const Parameters& p) {
          return p.front_end.segmenter.max_cluster_size >= p.front_end.segmenter.min_cluster_size;
        }},
-      {"front_end.descriptor", "must have one of eigenvalues, sizes and orientation switched on",
+      {"front_end.descriptor", "must have one of eigenvalues, sizes, orientation and context switched on",
        [](const Parameters& p) {
          const DescriptorParameters& descriptor = p.front_end.descriptor;
-         return descriptor.eigenvalues || descriptor.sizes || descriptor.orientation;
+         return descriptor.eigenvalues || descriptor.sizes || descriptor.orientation || descriptor.context;
        }},
       {"back_end.matching", "must limit nearest, max_distance or both; without either every segment matches all",
        [](const Parameters& p) { return p.back_end.matching.nearest > 0 || p.back_end.matching.max_distance > 0.0; }},

@@ -59,6 +59,7 @@ void TargetIndex::RefreshCentroids(const TargetMap& map) {
 std::vector<TargetCandidate> TargetIndex::Nearest(const Descriptor& query, RobotIndex robot, std::size_t count,
                                                   float max_distance) const {
   if (!index_) return {};
+  RequireSize(query);
   const Descriptor scaled = query.cwiseProduct(weights_);
   // Several of the nearest views may belong to one segment, or be closed to the robot: look on until there are enough
   // segments.
@@ -81,15 +82,19 @@ std::vector<TargetCandidate> TargetIndex::Nearest(const Descriptor& query, Robot
   }
 }
 
+void TargetIndex::RequireSize(const Descriptor& descriptor) const {
+  if (descriptor.size() != weights_.size())
+    throw std::invalid_argument("a descriptor of " + std::to_string(descriptor.size()) +
+                                " values does not fit the map's " + std::to_string(weights_.size()) +
+                                ": use the descriptor settings that the map was made with");
+}
+
 void TargetIndex::Insert(IndexedView view) {
   if (!index_) {
     weights_ = Descriptor::Ones(view.descriptor.size());
     index_.emplace(static_cast<std::size_t>(weights_.size()));
   }
-  if (view.descriptor.size() != weights_.size())
-    throw std::invalid_argument("a descriptor of " + std::to_string(view.descriptor.size()) +
-                                " values does not fit the map's " + std::to_string(weights_.size()) +
-                                ": use the descriptor settings that the map was made with");
+  RequireSize(view.descriptor);
   const std::uint64_t item = views_.size();
   items_[view.segment].push_back(item);
   index_->Insert(item, view.descriptor.cwiseProduct(weights_));

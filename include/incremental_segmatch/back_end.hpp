@@ -35,7 +35,7 @@ struct MatchingParameters {
   double max_distance = 0.0;      ///< and within this scaled descriptor distance; 0: no limit
   double time_window_s = 60.0;    ///< own views that were taken more recently are no targets (loop closure)
   double min_path_m = 50.0;       ///< nor are those taken less than this much of path ago
-  double requery_distance = 0.2;  ///< a segment is matched anew once its scaled descriptor moved so far
+  double requery_distance = 0.4;  ///< a segment is matched anew once its scaled descriptor moved so far
 };
 
 /// Whose scans are kept along a trajectory, and how many of them make a recognition's counterpart.

@@ -117,7 +117,8 @@ class FrontEnd {
   };
 
   SegmentDelta DescribeChanges(const SegmentUpdate& left, const SegmentUpdate& grown);
-  SegmentState DescribeSegment(SegmentId segment) const;
+  Surroundings AllSegments() const;
+  SegmentState DescribeSegment(SegmentId segment, const Surroundings& surroundings) const;
   bool IsNewView(const SegmentState& state);
   void ShowViews(const std::vector<VoxelHandle>& voxels, SegmentDelta* delta) const;
   SegmentDelta EmptyDelta() const;

@@ -49,7 +49,7 @@ class TargetIndex {
   std::size_t segments() const { return items_.size(); }
 
   /// The `count` nearest segments (0: all) within `max_distance` that are open to this robot, by ascending (distance,
-  /// segment).
+  /// segment). Throws std::invalid_argument if the query differs in size from the descriptors that are there.
   std::vector<TargetCandidate> Nearest(const Descriptor& query, RobotIndex robot, std::size_t count,
                                        float max_distance) const;
   /// True if the item still stands for a view that is open to this robot.
@@ -67,6 +67,7 @@ class TargetIndex {
   std::uint64_t generation() const { return generation_; }
 
  private:
+  void RequireSize(const Descriptor& descriptor) const;
   void Insert(IndexedView view);
   void Erase(std::uint64_t item);
   void Rescale();

@@ -7,6 +7,7 @@
 #include <map>
 #include <random>
 #include <set>
+#include <stdexcept>
 #include <tuple>
 
 namespace incremental_segmatch {
@@ -140,6 +141,22 @@ class RandomMap {
   std::size_t keep_;
   mutable std::size_t largest_ = 0;
 };
+
+TEST(TargetIndex, RefusesDescriptorsOfOtherSettings) {
+  TargetMap map{TargetMapParameters()};
+  map.RobotByName("owner");
+  map.AddPose(kOwner, 1, Pose::Identity());
+  for (const SegmentId id : {1, 2}) {
+    SegmentView view;
+    view.descriptor = Descriptor::Ones(id + 2);
+    map.UpdateSegment({kOwner, id}, view, false, 1);
+  }
+  TargetIndex index;
+  index.Open({kOwner, 1}, map, 1, false);
+  EXPECT_THROW(index.Open({kOwner, 2}, map, 1, false), std::invalid_argument);
+  EXPECT_THROW(index.Nearest(Descriptor::Ones(4), kOwner, 1, 1e9f), std::invalid_argument);
+  EXPECT_EQ(index.Nearest(Descriptor::Ones(3), kOwner, 1, 1e9f).size(), 1u);
+}
 
 TEST(TargetIndex, NearestIsThatOfAllOpenViewsOverRandomSequences) {
   for (unsigned seed = 0; seed < 1000; ++seed) {

@@ -2,6 +2,7 @@
 
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <cmath>
 #include <random>
 
@@ -113,6 +114,31 @@ TEST(Pipeline, AMissingDeltaIsNoticedAndAFullStateHeals) {
   EXPECT_FALSE(healed.missed_delta);
   EXPECT_EQ(healed.counts.local_segments, front_end.FullState().changed.size());
   EXPECT_FALSE(back_end.Process(front_end.Process(drive.scans[12]).delta).missed_delta);
+}
+
+TEST(Pipeline, DescriptorsKnowWhatStandsAroundEachSegment) {
+  // In a full state all segments are described at once: centroids and heights there give each one's context.
+  const FrontEndParameters parameters;
+  FrontEnd front_end(parameters, "robot");
+  for (std::size_t i = 0; i < 20; ++i) front_end.Process(TwoLaps().scans[i]);
+  front_end.ApplyJump(Eigen::Translation3d(3.0, -2.0, 0.1) * Eigen::AngleAxisd(0.2, Eigen::Vector3d::UnitZ()));
+  const std::vector<std::string>& names = front_end.describer().names();
+  const auto index_of = [&](const std::string& name) { return std::find(names.begin(), names.end(), name) - names.begin(); };
+  const double width_m = parameters.descriptor.context_radius_m / static_cast<double>(kContextRings);
+  const SegmentDelta state = front_end.FullState();
+  ASSERT_GT(state.changed.size(), 20u);
+  for (const SegmentState& segment : state.changed) {
+    Eigen::VectorXd heights_m = Eigen::VectorXd::Zero(kContextRings);
+    for (const SegmentState& other : state.changed) {
+      if (other.id == segment.id) continue;
+      const double distance_m = (other.centroid_odom - segment.centroid_odom).norm();
+      const double height_m = std::exp(other.descriptor[index_of("log_height")]) - parameters.grid.resolution_m;
+      for (Eigen::Index ring = 0; ring < kContextRings; ++ring)
+        heights_m[ring] += height_m * std::max(0.0, 1.0 - std::abs(distance_m / width_m - static_cast<double>(ring)));
+    }
+    const Eigen::VectorXf context = segment.descriptor.segment(index_of("context_1"), kContextRings);
+    EXPECT_LT((context.cast<double>() - heights_m.cwiseSqrt()).cwiseAbs().maxCoeff(), 2e-3) << "segment " << segment.id;
+  }
 }
 
 TEST(Pipeline, AJumpOfTheOdometryFrameLeavesTrackingAlone) {

@@ -4,6 +4,7 @@
 
 #include <Eigen/Eigenvalues>
 #include <Eigen/Geometry>
+#include <algorithm>
 #include <cmath>
 #include <random>
 #include <stdexcept>
@@ -17,7 +18,7 @@ Descriptor Describe(const std::vector<Eigen::Vector3d>& points, const Eigen::Vec
                     const DescriptorParameters& parameters = {}) {
   SegmentMoments moments;
   for (const Eigen::Vector3d& p : points) moments.Add(p);
-  return Describer(parameters, kResolution).Describe(moments, up);
+  return Describer(parameters, kResolution).Describe(moments, up, {});
 }
 
 std::vector<Eigen::Vector3d> RandomBox(std::mt19937& random, const Eigen::Vector3d& size, const Eigen::Matrix3d& R,
@@ -58,21 +59,103 @@ TEST(EigenvalueFeatures, RoundingBelowZeroCountsAsZeroAndNothingGivesZeros) {
   EXPECT_TRUE(EigenvalueFeatures({-1e-18, -1e-19, 0}).isZero());
 }
 
+SegmentMoments MomentsOf(const std::vector<Eigen::Vector3d>& points) {
+  SegmentMoments moments;
+  for (const Eigen::Vector3d& p : points) moments.Add(p);
+  return moments;
+}
+
+/// A pole of this height, the middle of it here.
+SegmentMoments Pole(const Eigen::Vector3d& middle, double height) {
+  const Eigen::Vector3d half(0, 0, 0.5 * height);
+  return MomentsOf({middle - half, middle + half});
+}
+
+TEST(ContextFeatures, TellHowMuchStandsHowFar) {
+  const double width_m = 2.0, radius_m = width_m * kContextRings;
+  const SegmentMoments segment = Pole({100, 200, 1}, 3.0);
+  const SegmentMoments on_a_ring = Pole({100 + 3 * width_m, 200, 1}, 4.0);
+  const SegmentMoments between_rings = Pole({100, 200 - 5.25 * width_m, 1}, 8.0);
+  const SegmentMoments above = Pole({100, 200, 1 + 3 * width_m}, 5.0);
+  const SegmentMoments outside = Pole({100 + radius_m, 200, 1}, 7.0);
+  Eigen::Matrix<float, kContextRings, 1> expected = Eigen::Matrix<float, kContextRings, 1>::Zero();
+  EXPECT_EQ(ContextFeatures(segment, {}, radius_m), expected);
+  EXPECT_EQ(ContextFeatures(segment, {&segment, &outside}, radius_m), expected) << "neither is around it";
+  expected[3] = std::sqrt(4.f + 5.f);
+  expected[5] = std::sqrt(6.f);
+  expected[6] = std::sqrt(2.f);
+  EXPECT_TRUE(ContextFeatures(segment, {&on_a_ring, &segment, &between_rings, &outside, &above}, radius_m).isApprox(expected, 1e-6f));
+}
+
+// By definition: each ring weighs distances like a tent as wide as its neighbours' middles are apart.
+TEST(ContextFeatures, AgreeWithAnOracleOverPoints) {
+  for (unsigned seed = 0; seed < 200; ++seed) {
+    SCOPED_TRACE("seed " + std::to_string(seed));
+    std::mt19937 random(seed);
+    std::uniform_real_distribution<double> size(0.1, 6.0), place(-30, 30), radius(1.0, 40.0), far(-1e4, 1e4);
+    const Eigen::Vector3d origin(far(random), far(random), far(random));
+    const double radius_m = radius(random);
+    std::vector<std::vector<Eigen::Vector3d>> clouds;
+    for (unsigned i = 0; i < seed % 40 + 1; ++i) {
+      const Eigen::Vector3d center = origin + Eigen::Vector3d(place(random), place(random), 0.1 * place(random));
+      clouds.push_back(RandomBox(random, {size(random), size(random), size(random)}, Eigen::Matrix3d::Identity(), center, 20));
+    }
+    std::vector<SegmentMoments> moments;
+    for (const auto& cloud : clouds) moments.push_back(MomentsOf(cloud));
+    Surroundings surroundings;
+    for (const SegmentMoments& m : moments) surroundings.push_back(&m);
+
+    const auto mean = [](const std::vector<Eigen::Vector3d>& cloud) {
+      Eigen::Vector3d sum = Eigen::Vector3d::Zero();
+      for (const Eigen::Vector3d& p : cloud) sum += p;
+      return Eigen::Vector3d(sum / static_cast<double>(cloud.size()));
+    };
+    const auto context = ContextFeatures(moments[0], surroundings, radius_m);
+    for (Eigen::Index ring = 0; ring < kContextRings; ++ring) {
+      double heights = 0.0;
+      for (std::size_t i = 1; i < clouds.size(); ++i) {
+        double low = clouds[i][0].z(), high = low;
+        for (const Eigen::Vector3d& p : clouds[i]) {
+          low = std::min(low, p.z());
+          high = std::max(high, p.z());
+        }
+        const double distance = (mean(clouds[i]) - mean(clouds[0])).norm();
+        const double middle = static_cast<double>(ring) * radius_m / static_cast<double>(kContextRings);
+        heights += (high - low) * std::max(0.0, 1.0 - std::abs(distance - middle) * kContextRings / radius_m);
+      }
+      EXPECT_NEAR(context[ring], std::sqrt(heights), 1e-4);
+    }
+  }
+}
+
 TEST(Describer, NamesEachValueAndSelectsGroups) {
-  EXPECT_EQ(Describer({true, true, true}, kResolution).size(), 14);
-  EXPECT_EQ(Describer({true, false, false}, kResolution).size(), 7);
-  EXPECT_EQ(Describer({false, true, false}, kResolution).size(), 5);
-  EXPECT_EQ(Describer({false, false, true}, kResolution).names(), (std::vector<std::string>{"upright_1", "upright_3"}));
+  EXPECT_EQ(Describer({true, true, true, true}, kResolution).size(), 14 + kContextRings);
+  EXPECT_EQ(Describer({true, false, false, false}, kResolution).size(), 7);
+  EXPECT_EQ(Describer({false, true, false, false}, kResolution).size(), 5);
+  EXPECT_EQ(Describer({false, false, true, false}, kResolution).names(), (std::vector<std::string>{"upright_1", "upright_3"}));
+  const std::vector<std::string> rings = Describer({false, false, false, true}, kResolution).names();
+  ASSERT_EQ(rings.size(), static_cast<std::size_t>(kContextRings));
+  EXPECT_EQ(rings.front(), "context_1");
+  EXPECT_EQ(rings.back(), "context_" + std::to_string(kContextRings));
   std::mt19937 random(1);
   const auto points = RandomBox(random, {1, 2, 3}, Eigen::Matrix3d::Identity(), {0, 0, 0}, 100);
   const Descriptor all = Describe(points);
-  EXPECT_EQ(Describe(points, Eigen::Vector3d::UnitZ(), {true, false, false}), all.head(7));
-  EXPECT_EQ(Describe(points, Eigen::Vector3d::UnitZ(), {false, true, false}), all.segment(7, 5));
-  EXPECT_EQ(Describe(points, Eigen::Vector3d::UnitZ(), {false, false, true}), all.tail(2));
+  EXPECT_EQ(Describe(points, Eigen::Vector3d::UnitZ(), {true, false, false, false}), all.head(7));
+  EXPECT_EQ(Describe(points, Eigen::Vector3d::UnitZ(), {false, true, false, false}), all.segment(7, 5));
+  EXPECT_EQ(Describe(points, Eigen::Vector3d::UnitZ(), {false, false, true, false}), all.segment(12, 2));
+  EXPECT_TRUE(all.tail(kContextRings).isZero()) << "nothing stands around it";
+
+  const SegmentMoments segment = MomentsOf(points), other = Pole({3, 1, 0}, 2.0);
+  const DescriptorParameters parameters{true, true, true, true, 10.0};
+  const Descriptor in_context = Describer(parameters, kResolution).Describe(segment, Eigen::Vector3d::UnitZ(), {&other});
+  EXPECT_EQ(in_context.head(14), all.head(14));
+  EXPECT_EQ(in_context.tail(kContextRings), ContextFeatures(segment, {&other}, 10.0));
 }
 
 TEST(Describer, RefusesNoFeaturesAndBadResolutions) {
-  EXPECT_THROW(Describer({false, false, false}, kResolution), std::invalid_argument);
+  EXPECT_THROW(Describer({false, false, false, false}, kResolution), std::invalid_argument);
+  EXPECT_THROW(Describer({true, true, true, true, 0.0}, kResolution), std::invalid_argument);
+  EXPECT_THROW(Describer({true, true, true, true, std::nan("")}, kResolution), std::invalid_argument);
   EXPECT_THROW(Describer({}, 0.0), std::invalid_argument);
   EXPECT_THROW(Describer({}, std::nan("")), std::invalid_argument);
 }
@@ -96,7 +179,7 @@ TEST(Describer, APointHasNoShape) {
   const Descriptor d = Describe({Eigen::Vector3d(1, 2, 3)});
   EXPECT_TRUE(d.allFinite());
   EXPECT_TRUE(d.head(7).isZero());
-  EXPECT_TRUE(d.tail(2).isZero());
+  EXPECT_TRUE(d.segment(12, 2).isZero());
 }
 
 // Values are those of an iterative decomposition of the two-pass covariance, also for degenerate shapes and far away.

@@ -138,7 +138,7 @@ TEST(Parameters, RelationsBetweenParametersAreChecked) {
   ExpectComplaint("front_end: {ground: {min_range_m: 50}}", {"front_end.ground.max_range_m: "});
   ExpectComplaint("front_end: {ground: {model: elevation, max_slope: 0.5}}", {"front_end.ground.clearance_m: "});
   ExpectComplaint("front_end: {ground: {model: elevation, cell_size_m: 0.01}}", {"front_end.ground.cell_size_m: "});
-  ExpectComplaint("front_end: {descriptor: {eigenvalues: false, sizes: false, orientation: false}}",
+  ExpectComplaint("front_end: {descriptor: {eigenvalues: false, sizes: false, orientation: false, context: false}}",
                   {"front_end.descriptor: "});
   ExpectComplaint("back_end: {matching: {nearest: 0}}", {"back_end.matching: "});
   ExpectComplaint("back_end: {recognizer: {max_tilt_rad: 0.2}}",
