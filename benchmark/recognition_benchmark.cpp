@@ -23,13 +23,21 @@ constexpr double kDensity_per_m2 = 0.01;  ///< correspondences over the target m
 constexpr std::size_t kLocalSegments = 50;
 constexpr double kLocalRadius_m = 50.0;
 
-/// 50 local segments within 50 m, correspondences at constant density over a square map, 15 of them true.
+/// 50 local segments within 50 m, correspondences at constant density over a target map, 15 of them true.
 class Scenario {
  public:
-  explicit Scenario(std::size_t correspondences) : random_(static_cast<unsigned>(correspondences)) {
+  /// A square map. A small one has more border, where a correspondence has fewer others to be tested with.
+  explicit Scenario(std::size_t correspondences) : Scenario(correspondences, correspondences) {}
+
+  /// A map of square districts with so many correspondences each, too far apart to be tested with each other: a
+  /// correspondence has as many others to be tested with, however large the map.
+  Scenario(std::size_t correspondences, std::size_t per_district) : random_(static_cast<unsigned>(correspondences)) {
     constexpr std::size_t kTrueMatches = 15;
     constexpr double kMatchesPerTarget = 3.0;
-    const double side_m = std::sqrt(static_cast<double>(correspondences) / kDensity_per_m2);
+    constexpr double kGap_m = 2.5 * kLocalRadius_m;
+    const double side_m = std::sqrt(static_cast<double>(per_district) / kDensity_per_m2);
+    const std::size_t districts = correspondences / per_district;
+    const auto districts_in_a_row = static_cast<std::size_t>(std::ceil(std::sqrt(static_cast<double>(districts))));
     std::vector<Eigen::Vector3d> locals;
     while (locals.size() < kLocalSegments) {
       const Eigen::Vector3d p(kLocalRadius_m * Signed(), kLocalRadius_m * Signed(), 2.0 * Signed());
@@ -43,7 +51,11 @@ class Scenario {
     const auto targets = static_cast<std::size_t>(static_cast<double>(correspondences) / kMatchesPerTarget) + 1;
     std::vector<Eigen::Vector3d> target_centroids;
     for (std::size_t i = 0; i < targets; ++i) {
-      target_centroids.emplace_back(0.5 * side_m * Signed(), 0.5 * side_m * Signed(), 2.0 * Signed());
+      const std::size_t district = i % districts;
+      const Eigen::Vector3d middle((side_m + kGap_m) * static_cast<double>(district % districts_in_a_row),
+                                   (side_m + kGap_m) * static_cast<double>(district / districts_in_a_row), 0.0);
+      target_centroids.push_back(middle +
+                                 Eigen::Vector3d(0.5 * side_m * Signed(), 0.5 * side_m * Signed(), 2.0 * Signed()));
     }
     while (correspondences_.size() < correspondences) {
       const std::size_t local = random_() % kLocalSegments;
@@ -111,8 +123,7 @@ RecognizerParameters Parameters(ConsistencyMethod method) {
 }
 
 /// Everything from the correspondences to the recognition.
-void RecognizeOurs(benchmark::State& state, ConsistencyMethod method) {
-  const Scenario scenario(static_cast<std::size_t>(state.range(0)));
+void Recognize(benchmark::State& state, ConsistencyMethod method, const Scenario& scenario) {
   Recognizer recognizer(Parameters(method));
   RecognizerResult result;
   double graph_ms = 0.0, clique_ms = 0.0;
@@ -127,6 +138,17 @@ void RecognizeOurs(benchmark::State& state, ConsistencyMethod method) {
   state.counters["tested_%"] = 100.0 * static_cast<double>(result.tested_pairs) / (n * (n - 1.0) / 2.0);
   state.counters["graph_ms"] = graph_ms / static_cast<double>(state.iterations());
   state.counters["clique_ms"] = clique_ms / static_cast<double>(state.iterations());
+  state.counters["tested_per_correspondence"] = static_cast<double>(result.tested_pairs) / n;
+}
+
+void RecognizeOurs(benchmark::State& state, ConsistencyMethod method) {
+  Recognize(state, method, Scenario(static_cast<std::size_t>(state.range(0))));
+}
+
+/// The same without the border of the map: how the time grows with the number of correspondences alone.
+void RecognizeInDistricts(benchmark::State& state, ConsistencyMethod method) {
+  constexpr std::size_t kPerDistrict = 1000;
+  Recognize(state, method, Scenario(static_cast<std::size_t>(state.range(0)), kPerDistrict));
 }
 
 /// A drive: the input changes a little from call to call; only the graph, from correspondences in the order in which
@@ -231,6 +253,11 @@ BENCHMARK_CAPTURE(RecognizeOurs, squares, ConsistencyMethod::kPartitioned2D)
     ->Arg(1000)
     ->Arg(2000)
     ->Arg(5500)
+    ->Arg(10000)
+    ->Arg(100000)
+    ->Unit(benchmark::kMillisecond);
+BENCHMARK_CAPTURE(RecognizeInDistricts, squares, ConsistencyMethod::kPartitioned2D)
+    ->Arg(1000)
     ->Arg(10000)
     ->Arg(100000)
     ->Unit(benchmark::kMillisecond);

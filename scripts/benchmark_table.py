@@ -17,8 +17,11 @@ def rows_of(path):
         # Stages on a drive report the median over its steps; the others CPU time per call.
         milliseconds = run.get("median_ms", to_ms * run["cpu_time"])
         parts = [part for part in run["name"].split("/") if not part.startswith(("iterations", "manual_time"))]
-        if parts[0] in ("RecognizeOurs", "RecognizeSequence"):
-            stage = "recognition" if parts[0] == "RecognizeOurs" else "consistency graph of a drive"
+        recognition_stages = {"RecognizeOurs": "recognition", "RecognizeSequence": "consistency graph of a drive"}
+        if parts[0] in recognition_stages:
+            yield recognition_stages[parts[0]], parts[2], parts[1], milliseconds, run
+        elif parts[0] == "RecognizeInDistricts":
+            stage = f"recognition without border, tested with {run['tested_per_correspondence']:.0f} each"
             yield stage, parts[2], parts[1], milliseconds, run
         elif parts[0] == "GroupWithPcl":
             yield "recognition", parts[1], "pcl", milliseconds, run

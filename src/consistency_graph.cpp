@@ -898,10 +898,14 @@ class ConsistencyGraphBuilder::Impl {
       vertices_.push_back(v);
     }
     partition_.Assign(matches_, parameters_.epsilon_m, layout);
+    vertex_of_slot_.clear();
+    for (std::uint32_t slot = 0; slot < partition_.size(); ++slot) {
+      vertex_of_slot_.push_back(vertices_[partition_.index(slot)]);
+    }
     edges_.clear();
     const std::uint64_t tested = partition_.ForEachPair([&](std::uint32_t a, std::uint32_t b) {
       if (Consistent(partition_.match(a), partition_.match(b), parameters_.epsilon_m, parameters_.max_vertical_slope)) {
-        edges_.emplace_back(vertices_[partition_.index(a)], vertices_[partition_.index(b)]);
+        edges_.emplace_back(vertex_of_slot_[a], vertex_of_slot_[b]);
       }
     });
     ConsistencyGraph graph = ConsistencyGraph::FromEdges(correspondences.size(), edges_);
@@ -912,8 +916,9 @@ class ConsistencyGraphBuilder::Impl {
   ConsistencyGraph BuildWithFastest(const Correspondences& correspondences);
 
   ConsistencyParameters parameters_;
-  std::vector<Match> matches_;           ///< of the last call, as what follows: memory that the next one reuses
-  std::vector<std::uint32_t> vertices_;  ///< of the matches
+  std::vector<Match> matches_;                 ///< of the last call, as what follows: memory that the next one reuses
+  std::vector<std::uint32_t> vertices_;        ///< of the matches
+  std::vector<std::uint32_t> vertex_of_slot_;  ///< the same in the partition's order
   std::vector<ConsistencyGraph::Edge> edges_;
   Partition partition_;
   Cache cache_;
