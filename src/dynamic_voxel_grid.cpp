@@ -102,62 +102,101 @@ NeighbourStencil::NeighbourStencil(double radius_m, double resolution_m) : radiu
   }
 }
 
-/// Open addressing with linear probing and backward-shift deletion: one cache line a lookup, no tombstones.
+/// Extendible hashing: entries lie in pages of 4 KB, found through a directory by the leading bits of their hash. A page
+/// that is half full is split in two, so that no insertion moves more than a page, however large the map. Within a page
+/// linear probing and backward-shift deletion: one cache line a lookup, no tombstones.
 class DynamicVoxelGrid::BlockMap {
  public:
-  BlockMap() : entries_(1024) {}
+  BlockMap() : directory_(std::size_t{1} << kFirstDepth) {
+    for (Page*& page : directory_) page = AddPage(kFirstDepth);
+  }
 
   /// Starts to fetch what Find will read.
-  void Prefetch(std::uint64_t key) const { __builtin_prefetch(&entries_[Home(key)]); }
+  void Prefetch(std::uint64_t key) const {
+    const std::uint64_t hash = Hash(key);
+    __builtin_prefetch(&PageOf(hash)->entries[Home(hash)]);
+  }
   std::uint32_t Find(std::uint64_t key) const {
-    for (std::size_t i = Home(key);; i = (i + 1) & (entries_.size() - 1)) {
-      if (entries_[i].slot == kNoBlock) return kNoBlock;
-      if (entries_[i].key == key) return entries_[i].slot;
+    const std::uint64_t hash = Hash(key);
+    const Entries& entries = PageOf(hash)->entries;
+    for (std::size_t i = Home(hash);; i = (i + 1) % kPageSize) {
+      if (entries[i].slot == kNoBlock) return kNoBlock;
+      if (entries[i].key == key) return entries[i].slot;
     }
   }
   void Insert(std::uint64_t key, std::uint32_t slot) {
-    if (2 * ++size_ > entries_.size()) {
-      std::vector<Entry> old(2 * entries_.size());
-      old.swap(entries_);
-      for (const Entry& entry : old)
-        if (entry.slot != kNoBlock) Place(entry);
-    }
+    while (2 * PageOf(Hash(key))->size >= kPageSize) Split(Hash(key));
     Place({key, slot});
   }
   void Erase(std::uint64_t key) {
-    const std::size_t mask = entries_.size() - 1;
-    std::size_t hole = Home(key);
-    while (entries_[hole].key != key || entries_[hole].slot == kNoBlock) hole = (hole + 1) & mask;
-    for (std::size_t i = (hole + 1) & mask; entries_[i].slot != kNoBlock; i = (i + 1) & mask) {
+    Page* const page = PageOf(Hash(key));
+    Entries& entries = page->entries;
+    std::size_t hole = Home(Hash(key));
+    while (entries[hole].key != key || entries[hole].slot == kNoBlock) hole = (hole + 1) % kPageSize;
+    for (std::size_t i = (hole + 1) % kPageSize; entries[i].slot != kNoBlock; i = (i + 1) % kPageSize) {
       // An entry moves into the hole unless its home lies cyclically in (hole, i].
-      if (((i - Home(entries_[i].key)) & mask) >= ((i - hole) & mask)) {
-        entries_[hole] = entries_[i];
+      if ((i - Home(Hash(entries[i].key))) % kPageSize >= (i - hole) % kPageSize) {
+        entries[hole] = entries[i];
         hole = i;
       }
     }
-    entries_[hole].slot = kNoBlock;
-    --size_;
+    entries[hole].slot = kNoBlock;
+    --page->size;
   }
-  std::size_t memory_bytes() const { return entries_.size() * sizeof(Entry); }
+  std::size_t memory_bytes() const { return pages_.memory_bytes() + directory_.capacity() * sizeof(Page*); }
 
  private:
+  static constexpr int kFirstDepth = 2;
+  static constexpr std::size_t kPageSize = 256;
   struct Entry {
     std::uint64_t key = 0;
     std::uint32_t slot = kNoBlock;
   };
-  std::size_t Home(std::uint64_t key) const {
-    key ^= key >> 32;
-    key *= 0x9e3779b97f4a7c15ull;
-    return (key >> 32) & (entries_.size() - 1);
+  using Entries = std::array<Entry, kPageSize>;
+  struct alignas(64) Page {
+    Entries entries;
+    std::size_t size = 0;  ///< entries that are taken
+    int depth = 0;         ///< leading bits that the hashes have in common
+  };
+
+  static std::uint64_t Hash(std::uint64_t key) { return (key ^ key >> 32) * 0x9e3779b97f4a7c15ull; }
+  static std::size_t Home(std::uint64_t hash) { return (hash >> 32) % kPageSize; }
+  Page* PageOf(std::uint64_t hash) const { return directory_[hash >> (64 - depth_)]; }
+  Page* AddPage(int depth) {
+    pages_.Grow(pages_.size() + 1);
+    Page* const page = &pages_[pages_.size() - 1];
+    page->depth = depth;
+    return page;
   }
   void Place(const Entry& entry) {
-    std::size_t i = Home(entry.key);
-    while (entries_[i].slot != kNoBlock) i = (i + 1) & (entries_.size() - 1);
-    entries_[i] = entry;
+    Page* const page = PageOf(Hash(entry.key));
+    std::size_t i = Home(Hash(entry.key));
+    while (page->entries[i].slot != kNoBlock) i = (i + 1) % kPageSize;
+    page->entries[i] = entry;
+    ++page->size;
+  }
+  /// Tells the entries of a hash's page apart by one more bit.
+  void Split(std::uint64_t hash) {
+    Page* const page = PageOf(hash);
+    if (page->depth == depth_) {
+      std::vector<Page*> finer(2 * directory_.size());
+      for (std::size_t i = 0; i < finer.size(); ++i) finer[i] = directory_[i / 2];
+      directory_ = std::move(finer);
+      ++depth_;
+    }
+    const int depth = ++page->depth;
+    const std::size_t half = std::size_t{1} << (depth_ - depth);  // of the directory's entries for the page
+    const std::size_t ones = (hash >> (64 - depth) | 1) * half;   // those with the bit set
+    std::fill_n(directory_.begin() + static_cast<std::ptrdiff_t>(ones), half, AddPage(depth));
+    const Entries entries = std::exchange(page->entries, Entries());
+    page->size = 0;
+    for (const Entry& entry : entries)
+      if (entry.slot != kNoBlock) Place(entry);
   }
 
-  std::vector<Entry> entries_;
-  std::size_t size_ = 0;
+  PagedArray<Page> pages_;
+  int depth_ = kFirstDepth;  ///< leading bits that the directory tells apart
+  std::vector<Page*> directory_;
 };
 
 /// Blocks by columns of 8 x 8 blocks: removal looks at whole columns first, and only when the boundary may have come to

@@ -182,6 +182,42 @@ TEST(DynamicVoxelGrid, EqualsMapFromCellToPointsAfterAnySequence) {
   EXPECT_GT(removals, 10000u);
 }
 
+// Far more blocks than above: their map grows, and empties, over and over.
+TEST(DynamicVoxelGrid, EqualsMapFromCellToPointsWithManyBlocks) {
+  for (unsigned seed = 0; seed < 6; ++seed) {
+    SCOPED_TRACE("seed " + std::to_string(seed));
+    std::mt19937 random(seed);
+    Reference reference;
+    DynamicVoxelGrid grid(reference.parameters);
+    std::map<VoxelHandle, Cell> handles;
+    std::uniform_real_distribution<float> coordinate(-40.f, 40.f);
+    std::size_t most_voxels = 0;
+    for (int step = 0; step < 12; ++step) {
+      Points points;
+      for (int i = 0; i < 2000; ++i) points.emplace_back(coordinate(random), coordinate(random), 0.1f * coordinate(random));
+      if (step > 0) points.insert(points.end(), points.begin(), points.begin() + 500);
+      for (const Eigen::Vector3f& p : points) {
+        Reference::Content& content = reference.cells[reference.CellOf(p.cast<double>())];
+        content.sum += p.cast<double>();
+        ++content.count;
+      }
+      for (const VoxelHandle voxel : grid.Insert(points, Pose::Identity()).activated)
+        ASSERT_TRUE(handles.emplace(voxel, CellOfVoxel(grid, reference, voxel)).second) << "a handle was given twice";
+      most_voxels = std::max(most_voxels, grid.active_voxels());
+      if (step % 3 == 2) {
+        const Eigen::Vector3d center(coordinate(random), coordinate(random), 0.0);
+        const double radius_m = std::uniform_real_distribution<double>(10.0, 60.0)(random);
+        for (const RemovedVoxel& voxel : grid.RemoveOutside(center, radius_m).removed) handles.erase(voxel.voxel);
+        for (auto it = reference.cells.begin(); it != reference.cells.end();)
+          it = (it->second.Centroid() - center).head<2>().norm() > radius_m ? reference.cells.erase(it) : std::next(it);
+      }
+      ASSERT_NO_FATAL_FAILURE(ExpectEqual(grid, reference, handles));
+      if (HasFailure()) return;
+    }
+    EXPECT_GT(most_voxels, 5000u);
+  }
+}
+
 TEST(DynamicVoxelGrid, NeighboursEqualExhaustiveSearch) {
   for (unsigned seed = 0; seed < 1000; ++seed) {
     SCOPED_TRACE("seed " + std::to_string(seed));
