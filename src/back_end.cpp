@@ -432,7 +432,8 @@ bool BackEnd::MatchSegment(RobotIndex robot, LocalSegment* segment) const {
   }
   const bool query = NeedsQuery(robot, *segment);
   if (query) {
-    candidates = index_.Nearest(segment->descriptor, robot, nearest, max_distance);
+    if (segment->queried_generation != index_.generation()) candidates.clear();
+    candidates = index_.Nearest(segment->descriptor, robot, nearest, max_distance, candidates);
     segment->queried = segment->descriptor;
     segment->queried_generation = index_.generation();
   } else {

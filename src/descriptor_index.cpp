@@ -15,7 +15,13 @@
 namespace incremental_segmatch {
 namespace {
 
-using Distance = flann::L2<float>;  // squared
+/// Squared distance; FLANN's own takes one value at a time.
+struct Distance : flann::L2<float> {
+  float operator()(const float* a, const float* b, std::size_t size, float /*worst*/ = -1.f) const {
+    using Values = Eigen::Map<const Eigen::VectorXf>;
+    return (Values(a, static_cast<Eigen::Index>(size)) - Values(b, static_cast<Eigen::Index>(size))).squaredNorm();
+  }
+};
 using KdTree = flann::KDTreeSingleIndex<Distance>;
 
 constexpr std::size_t kBufferSize = 64;  // items searched directly; a tree of level i holds up to kBufferSize << i

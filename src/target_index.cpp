@@ -57,14 +57,15 @@ void TargetIndex::RefreshCentroids(const TargetMap& map) {
 }
 
 std::vector<TargetCandidate> TargetIndex::Nearest(const Descriptor& query, RobotIndex robot, std::size_t count,
-                                                  float max_distance) const {
+                                                  float max_distance, const std::vector<TargetCandidate>& known) const {
   if (!index_) return {};
   RequireSize(query);
   const Descriptor scaled = query.cwiseProduct(weights_);
+  const float radius = std::min(max_distance, FarthestOf(known, query, robot, count));
   // Several of the nearest views may belong to one segment, or be closed to the robot: look on until there are enough
   // segments.
   for (std::size_t wanted = count == 0 ? index_->size() : 2 * count;; wanted *= 2) {
-    const std::vector<DescriptorMatch> matches = index_->Nearest(scaled, wanted, max_distance);
+    const std::vector<DescriptorMatch> matches = index_->Nearest(scaled, wanted, radius);
     std::unordered_set<SegmentKey, SegmentKeyHash> seen;
     std::vector<TargetCandidate> candidates;
     for (const DescriptorMatch& match : matches) {
@@ -87,6 +88,22 @@ void TargetIndex::RequireSize(const Descriptor& descriptor) const {
     throw std::invalid_argument("a descriptor of " + std::to_string(descriptor.size()) +
                                 " values does not fit the map's " + std::to_string(weights_.size()) +
                                 ": use the descriptor settings that the map was made with");
+}
+
+/// An upper bound of how far the `count` nearest segments are; infinity if fewer than that are known.
+float TargetIndex::FarthestOf(const std::vector<TargetCandidate>& known, const Descriptor& query, RobotIndex robot,
+                              std::size_t count) const {
+  constexpr float kRounding = 1e-5f;
+  std::size_t open = 0;
+  float farthest = 0.f;
+  for (const TargetCandidate& candidate : known) {
+    if (open == count) break;
+    if (!IsOpen(candidate.item, robot)) continue;
+    farthest = std::max(farthest, Distance(query, views_[candidate.item].descriptor));
+    ++open;
+  }
+  if (count == 0 || open < count) return std::numeric_limits<float>::infinity();
+  return farthest * (1.f + kRounding) + kRounding;
 }
 
 void TargetIndex::Insert(IndexedView view) {

@@ -49,9 +49,11 @@ class TargetIndex {
   std::size_t segments() const { return items_.size(); }
 
   /// The `count` nearest segments (0: all) within `max_distance` that are open to this robot, by ascending (distance,
-  /// segment). Throws std::invalid_argument if the query differs in size from the descriptors that are there.
-  std::vector<TargetCandidate> Nearest(const Descriptor& query, RobotIndex robot, std::size_t count,
-                                       float max_distance) const;
+  /// segment). What an earlier query of the same generation found, one view a segment, may be given as `known`: nothing
+  /// farther than those need be looked at. The result is the same without. Throws std::invalid_argument if the query
+  /// differs in size from the descriptors that are there.
+  std::vector<TargetCandidate> Nearest(const Descriptor& query, RobotIndex robot, std::size_t count, float max_distance,
+                                       const std::vector<TargetCandidate>& known = {}) const;
   /// True if the item still stands for a view that is open to this robot.
   bool IsOpen(std::uint64_t item, RobotIndex robot) const {
     return views_[item].live && (views_[item].released || views_[item].robot != robot);
@@ -68,6 +70,8 @@ class TargetIndex {
 
  private:
   void RequireSize(const Descriptor& descriptor) const;
+  float FarthestOf(const std::vector<TargetCandidate>& known, const Descriptor& query, RobotIndex robot,
+                   std::size_t count) const;
   void Insert(IndexedView view);
   void Erase(std::uint64_t item);
   void Rescale();

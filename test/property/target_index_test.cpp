@@ -64,6 +64,17 @@ class RandomMap {
       EXPECT_NEAR(index_.Distance(query, seen.descriptor), found[i].distance, 1e-4f);
       EXPECT_LT((view.centroid_map - map_.CentroidMap(seen)).norm(), 1e-9);
     }
+
+    // What was found before, for any query, spares work and changes nothing.
+    if (known_generation_ != index_.generation()) known_.clear();
+    const std::vector<TargetCandidate> again = index_.Nearest(query, robot, count, kFar, known_);
+    ASSERT_EQ(again.size(), found.size());
+    for (std::size_t i = 0; i < found.size(); ++i) {
+      EXPECT_EQ(again[i].segment, found[i].segment);
+      EXPECT_EQ(again[i].distance, found[i].distance);
+    }
+    known_ = found;
+    known_generation_ = index_.generation();
   }
 
   void ExpectBounded() const {
@@ -139,6 +150,8 @@ class RandomMap {
   StampNs stamp_ns_ = 0;
   SegmentId last_id_ = 0;
   std::size_t keep_;
+  std::vector<TargetCandidate> known_;
+  std::uint64_t known_generation_ = 0;
   mutable std::size_t largest_ = 0;
 };
 
