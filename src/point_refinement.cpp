@@ -29,6 +29,9 @@ constexpr double kSettled = 0.1;          // this share of it
 constexpr double kFineSpacing = 0.5;        // of the target's points, over the distance to a partner at the end
 constexpr double kStale = 0.2;  // motion over the spacing of the target's points, after which partners are sought anew
 constexpr double kFineWidth = 1.0 / 3.0;  // of the robust weight in the last iteration, over the distance to a partner
+constexpr double kSearchStep = 0.5;       // between places that are tried, over the distance to a partner in the beginning
+constexpr double kSearchGain = 0.05;      // in overlap, from which another place is worth a refinement
+constexpr std::size_t kSearchPoints = 300;
 constexpr double kConvergedM = 5e-4;      // motion of the points in the last iteration
 constexpr double kMaxExtentM = 1e5;       // floats are exact enough to a centimetre up to here
 constexpr std::uint32_t kNone = 0xffffffffu;
@@ -411,6 +414,10 @@ void Validate(const RefinementParameters& parameters) {
   if (!is_length(parameters.min_distance_m)) Refuse("min_distance_m", parameters.min_distance_m, "positive and finite");
   if (!(parameters.max_distance_m >= parameters.min_distance_m) || !is_length(parameters.max_distance_m))
     Refuse("max_distance_m", parameters.max_distance_m, "finite and at least min_distance_m");
+  if (!(parameters.search_m >= 0.0) || !std::isfinite(parameters.search_m))
+    Refuse("search_m", parameters.search_m, "finite and not negative");
+  if (!(parameters.search_overlap >= 0.0 && parameters.search_overlap <= 1.0))
+    Refuse("search_overlap", parameters.search_overlap, "between 0 and 1");
   if (parameters.max_iterations < 1) Refuse("max_iterations", parameters.max_iterations, "at least 1");
   if (!(parameters.min_overlap >= 0.0 && parameters.min_overlap <= 1.0))
     Refuse("min_overlap", parameters.min_overlap, "between 0 and 1");
@@ -435,6 +442,14 @@ struct Partners {
   double moved_m = 0.0;                  ///< by which the points have moved since they were found
 };
 
+/// Where an attempt came to rest.
+struct Fit {
+  Pose T_target_local = Pose::Identity();  ///< both relative to their centers
+  System system;
+  Partners partners;
+  double overlap = 0.0;
+};
+
 /// Relative to its own center, as the local cloud is to its own: floats and normal equations are good at small numbers.
 struct RefinementTarget::Impl {
   Impl(const std::vector<Eigen::Vector3d>& points, const RefinementParameters& parameters)
@@ -454,6 +469,55 @@ struct RefinementTarget::Impl {
       *partners = {FindPartners(local, T, target->cells(), distance), target, 0.0};
     return incremental_segmatch::BuildSystem(local, partners->points, T, target, fine.cells(),
                                              static_cast<float>(parameters.normal_radius_m), distance, width_m);
+  }
+
+  /// Iterative closest points from one place on: wide as long as far points are far from their true partners; the distance to a
+  /// partner follows down to its minimum. Nothing if too few have partners.
+  std::optional<Fit> Descend(const std::vector<Eigen::Vector3f>& local, const std::vector<Eigen::Vector3f>& coarse_local, Pose T) {
+    const double last_width_m = kFineWidth * parameters.min_distance_m;
+    double width_m = parameters.max_distance_m;
+    Fit fit;
+    bool converged = false;
+    for (int iteration = 0; iteration < parameters.max_iterations && !converged; ++iteration) {
+      const bool is_last = width_m == last_width_m;
+      fit.system = BuildSystem(is_last ? local : coarse_local, T, width_m, &fit.partners);
+      if (fit.system.pairs < kMinPairs) return std::nullopt;
+      const auto [step, length_m] = Directions(fit.system, parameters.min_stiffness).Step(fit.system.gradient);
+      T = Perturb(step, T);
+      fit.partners.moved_m += length_m;
+      converged = is_last && length_m < kConvergedM;
+      width_m = std::max(last_width_m, (length_m < kSettled * width_m ? kSettledShrink : kShrink) * width_m);
+    }
+    if (!converged) fit.system = BuildSystem(local, T, last_width_m, &fit.partners);
+    if (fit.system.pairs < kMinPairs) return std::nullopt;
+    fit.T_target_local = T;
+    fit.overlap = static_cast<double>(fit.system.pairs) / static_cast<double>(local.size());
+    return fit;
+  }
+
+  /// Of a grid of places around one, along x and y, that where most points have a partner; nothing if it is hardly better than
+  /// the one in the middle.
+  std::optional<Pose> Search(const std::vector<Eigen::Vector3f>& local, const Pose& T_middle) const {
+    const auto overlap = [&](const Pose& T) {
+      const std::vector<std::uint32_t> partners =
+          FindPartners(local, T, fine.cells(), static_cast<float>(parameters.min_distance_m));
+      const auto alone = std::count(partners.begin(), partners.end(), kNone);
+      return 1.0 - static_cast<double>(alone) / static_cast<double>(partners.size());
+    };
+    double best = overlap(T_middle) + kSearchGain;
+    std::optional<Pose> best_T;
+    const double step_m = kSearchStep * parameters.max_distance_m;
+    const int steps = static_cast<int>(parameters.search_m / step_m);
+    for (int x = -steps; x <= steps; ++x) {
+      for (int y = -steps; y <= steps; ++y) {
+        const Pose T = Eigen::Translation3d(step_m * x, step_m * y, 0.0) * T_middle;
+        const double there = overlap(T);
+        if (there <= best) continue;
+        best = there;
+        best_T = T;
+      }
+    }
+    return best_T;
   }
 
   RefinementParameters parameters;
@@ -482,30 +546,22 @@ std::optional<RefinedTransform> RefinementTarget::Refine(const std::vector<Eigen
   const std::vector<Eigen::Vector3f> local = Thin(Center(points_local, center_local), parameters.max_points);
   if (local.size() < kMinPairs || impl_->fine.cells().points().size() < kMinPairs) return std::nullopt;
   const std::vector<Eigen::Vector3f> coarse_local = Thin(local, kMaxCoarsePoints);
-  Pose T = Eigen::Translation3d(-center_target) * T_target_local * Eigen::Translation3d(center_local);
-
-  // Wide as long as far points are far from their true partners; the distance to a partner follows down to its minimum.
-  const double last_width_m = kFineWidth * parameters.min_distance_m;
-  double width_m = parameters.max_distance_m;
-  System system;
-  Partners partners;
-  bool converged = false;
-  for (int iteration = 0; iteration < parameters.max_iterations && !converged; ++iteration) {
-    const bool is_last = width_m == last_width_m;
-    system = impl_->BuildSystem(is_last ? local : coarse_local, T, width_m, &partners);
-    if (system.pairs < kMinPairs) return std::nullopt;
-    const auto [step, length_m] = Directions(system, parameters.min_stiffness).Step(system.gradient);
-    T = Perturb(step, T);
-    partners.moved_m += length_m;
-    converged = is_last && length_m < kConvergedM;
-    width_m = std::max(last_width_m, (length_m < kSettled * width_m ? kSettledShrink : kShrink) * width_m);
+  const Pose T_begin = Eigen::Translation3d(-center_target) * T_target_local * Eigen::Translation3d(center_local);
+  std::optional<Fit> fit = impl_->Descend(local, coarse_local, T_begin);
+  if (!fit || fit->overlap < parameters.search_overlap) {
+    if (const auto T_better = impl_->Search(Thin(local, kSearchPoints), fit ? fit->T_target_local : T_begin)) {
+      std::optional<Fit> other = impl_->Descend(local, coarse_local, *T_better);
+      if (other && (!fit || other->overlap > fit->overlap)) fit = std::move(other);
+    }
   }
-  if (!converged) system = impl_->BuildSystem(local, T, last_width_m, &partners);
+  if (!fit || fit->overlap < parameters.min_overlap) return std::nullopt;
+  const System& system = fit->system;
+  const Pose& T = fit->T_target_local;
 
   RefinedTransform refined;
-  refined.has_partner = HavePartners(local, partners.points, T, partners.target->cells(), parameters.min_distance_m);
-  refined.overlap = static_cast<double>(system.pairs) / static_cast<double>(local.size());
-  if (system.pairs < kMinPairs || refined.overlap < parameters.min_overlap) return std::nullopt;
+  refined.has_partner =
+      HavePartners(local, fit->partners.points, T, fit->partners.target->cells(), parameters.min_distance_m);
+  refined.overlap = fit->overlap;
   const Directions directions(system, parameters.min_stiffness);
   refined.open_directions = directions.open;
   if (directions.open > parameters.max_open_directions) return std::nullopt;

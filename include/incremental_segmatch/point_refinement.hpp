@@ -19,6 +19,8 @@ struct RefinementParameters {
   int max_iterations = 20;      ///< of nearest neighbours and least squares
   double min_overlap =
       0.3;  ///< share of the local points with a partner in the last iteration; less refuses the recognition
+  double search_m = 1.5;        ///< so far around, along x and y, a better place to begin is looked for; 0: nowhere
+  double search_overlap = 0.9;  ///< where the first attempt ends with less overlap than this
   double normal_radius_m = 0.4;   ///< of the neighbourhood that tells which way a target point's surface faces
   std::size_t max_points = 3000;  ///< local points that are used, spread evenly over the list
   double min_stiffness =
@@ -45,7 +47,8 @@ struct RefinedTransform {
 ///
 /// Iterative closest points over two clouds in their own frames (metres, relative to any origin): robustly weighted
 /// Gauss-Newton on distances across what is thin about a target point (a surface, a pole), or to the point itself where
-/// nothing is. Deterministic; points that are not finite are ignored. Not thread-safe.
+/// nothing is. Where that ends with little overlap, places around are tried: what begins too far away may come to rest in a
+/// wrong minimum. Deterministic; points that are not finite are ignored. Not thread-safe.
 class RefinementTarget {
  public:
   /// Throws std::invalid_argument naming the parameter that is out of range. O(points).

@@ -166,6 +166,30 @@ TEST(PointRefinement, RecoversDisturbancesInHalfSeenScenes) {
   EXPECT_GE(good, 29);
 }
 
+TEST(PointRefinement, LooksAroundWhereTheFirstAttemptFitsBadly) {
+  RefinementParameters alone;
+  alone.search_m = 0.0;
+  alone.min_overlap = 0.0;
+  RefinementParameters with_search;
+  with_search.min_overlap = 0.0;
+  int good_alone = 0, good_with_search = 0;
+  for (unsigned seed = 0; seed < 30; ++seed) {
+    std::mt19937 random(seed);
+    const Problem problem = MakeProblem(random);
+    std::uniform_real_distribution<double> direction(-M_PI, M_PI);
+    const double angle = direction(random);
+    const Pose begin = Disturb(problem, Pose(Eigen::Translation3d(2.0 * std::cos(angle), 2.0 * std::sin(angle), 0.0)));
+    const auto is_good = [&](const RefinementParameters& parameters) {
+      const auto refined = RefineOnPoints(problem.local, problem.target, begin, parameters);
+      return refined && (problem.T_target_local.inverse() * refined->T_target_local).translation().norm() < 0.03;
+    };
+    good_alone += is_good(alone);
+    good_with_search += is_good(with_search);
+  }
+  EXPECT_LE(good_alone, 20) << "nothing to look for";
+  EXPECT_GE(good_with_search, 25);
+}
+
 TEST(PointRefinement, TheCovarianceTellsTheError) {
   int within_two = 0, within_four = 0;
   double sum = 0.0;
@@ -309,6 +333,8 @@ TEST(PointRefinement, NamesTheParameterThatIsOutOfRange) {
   };
   expect_refused("max_distance_m", [](auto* p) { p->max_distance_m = 0.1; });
   expect_refused("min_distance_m", [](auto* p) { p->min_distance_m = 0.0; });
+  expect_refused("search_m", [](auto* p) { p->search_m = -1.0; });
+  expect_refused("search_overlap", [](auto* p) { p->search_overlap = 1.1; });
   expect_refused("max_iterations", [](auto* p) { p->max_iterations = 0; });
   expect_refused("min_overlap", [](auto* p) { p->min_overlap = 1.1; });
   expect_refused("normal_radius_m", [](auto* p) { p->normal_radius_m = std::nan(""); });
