@@ -23,7 +23,7 @@ struct AcceptanceParameters {
   /// For so much of path after twins, though some steps may see no rival, and where there is one, more is demanded:
   double twin_memory_m = 100.0;
   double min_track_m = 50.0;      ///< path over which recognitions agree with each other by odometry,
-  double min_track_fit = 0.975;   ///< scans that overlap the map's along it, in the mean, as well as those each other,
+  double min_track_fit = 0.99;    ///< scans that overlap the map's along it, in the mean, as well as those each other,
   double min_distinction = 0.75;  ///< and a rival that explains so much less of what only one of the places explains
   double max_distance_m = 20.0;  ///< of the query from the pose its target was seen from: odometry drifts in between
   double max_sigma_m = 0.5;      ///< largest standard deviation of the query's position, along its worst axis

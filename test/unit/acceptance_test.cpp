@@ -51,14 +51,14 @@ TEST(Acceptance, WhereSegmentsDeceiveTheWayAndTheScansDecide) {
     evidence.runner_up = 19;
     evidence.distinction = 0.8;
     evidence.track_m = 51.0;
-    evidence.track_fit = 0.99;
+    evidence.track_fit = 0.995;
     change(evidence);
     return Judge(evidence, parameters);
   };
   EXPECT_EQ(judge([](Evidence&) {}), Verdict::kAccepted);
   EXPECT_EQ(judge([](Evidence& e) { e.distinction = 0.7; }), Verdict::kAmbiguous);
   EXPECT_EQ(judge([](Evidence& e) { e.track_m = 49.0; }), Verdict::kAmbiguous);
-  EXPECT_EQ(judge([](Evidence& e) { e.track_fit = 0.97; }), Verdict::kAmbiguous);
+  EXPECT_EQ(judge([](Evidence& e) { e.track_fit = 0.985; }), Verdict::kAmbiguous);
   EXPECT_EQ(judge([](Evidence& e) { e.runner_up = 0, e.distinction = 0.0, e.since_twin_m = 50.0; }), Verdict::kAccepted)
       << "no rival now";
   EXPECT_EQ(judge([](Evidence& e) { e.contradiction = 0.07; }), Verdict::kContradicted);
@@ -76,7 +76,7 @@ TEST(Acceptance, StrengthIsTheSmallestFactorByWhichALimitIsKept) {
   evidence.since_twin_m = 25.0;
   EXPECT_DOUBLE_EQ(Strength(evidence, parameters), 0.25);
   evidence.track_m = 60.0;
-  evidence.track_fit = 0.98;
+  evidence.track_fit = 0.995;
   EXPECT_DOUBLE_EQ(Strength(evidence, parameters), 60.0 / 50.0) << "borne out by the way";
   evidence.on_proven_track = true;
   EXPECT_DOUBLE_EQ(Strength(evidence, parameters), 2.0);
