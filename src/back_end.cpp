@@ -163,8 +163,7 @@ BackEndStep BackEnd::AttemptRecognition(RobotIndex robot, StageTimer timer) {
   timer.Lap("recognition");
 
   step.counts.end = ToStepEnd(result.outcome);
-  std::optional<Hypothesis> judged;
-  judged = Verify(robot, by_frame, result, &step);
+  std::optional<Hypothesis> judged = Verify(robot, by_frame, result, &step);
   const bool is_recognized = step.counts.end == StepEnd::kRecognized;
   if (judged && HasRival(judged->closure.evidence, parameters_.acceptance) &&
       judged->closure.evidence.runner_up >= parameters_.acceptance.twin_size) {

@@ -50,6 +50,7 @@ const SegmentView& BackEnd::MatchedView(RobotIndex robot, const Correspondence& 
 std::optional<BackEnd::Hypothesis> BackEnd::Verify(RobotIndex robot, const std::map<RobotIndex, Correspondences>& by_frame,
                                                    const RecognizerResult& result, BackEndStep* step) {
   const AcceptanceParameters& limits = parameters_.acceptance;
+  ForgetTracks(robot);
   std::optional<Hypothesis> best = BestHypothesis(robot, by_frame, result, &step->counts.end);
   if (!best) return std::nullopt;
 
@@ -121,8 +122,8 @@ std::optional<BackEnd::Hypothesis> BackEnd::LayOnScans(RobotIndex robot, const R
 std::optional<BackEnd::Hypothesis> BackEnd::ContinueTrack(RobotIndex index, const std::map<RobotIndex, Correspondences>& by_frame,
                                                           std::size_t rival_size) {
   const Robot& robot = robots_[index];
-  const auto track = std::find_if(robot.tracks.rbegin(), robot.tracks.rend(),
-                                  [&](const Track& track) { return track.is_proven && !IsOver(index, track); });
+  const auto track =
+      std::find_if(robot.tracks.rbegin(), robot.tracks.rend(), [](const Track& track) { return track.is_proven; });
   if (track == robot.tracks.rend()) return std::nullopt;
   const auto matches = by_frame.find(robots_[track->target.robot].frame);
   if (matches == by_frame.end()) return std::nullopt;
@@ -144,8 +145,14 @@ Pose BackEnd::PlaceNow(RobotIndex robot, const Track& track) const {
   return PoseOf(track.target).T_map_sensor * track.T_target_query * track.T_odom_sensor.inverse() * robots_[robot].T_odom_sensor;
 }
 
-bool BackEnd::IsOver(RobotIndex robot, const Track& track) const {
-  return robots_[robot].path_m - track.fits.back().path_m > parameters_.acceptance.min_track_m;
+/// Drops the tracks that nothing has continued for as long as a track must be.
+void BackEnd::ForgetTracks(RobotIndex index) {
+  Robot& robot = robots_[index];
+  robot.tracks.erase(std::remove_if(robot.tracks.begin(), robot.tracks.end(),
+                                    [&](const Track& track) {
+                                      return robot.path_m - track.fits.back().path_m > parameters_.acceptance.min_track_m;
+                                    }),
+                     robot.tracks.end());
 }
 
 /// Of two hypotheses that which continues a proven track, unless scans speak for the other one; otherwise that which explains
@@ -193,13 +200,12 @@ double BackEnd::Distinction(const Hypothesis& first, const Hypothesis& second) {
   return all == 0 ? 0.5 : static_cast<double>(only_first) / static_cast<double>(all);
 }
 
-/// Of the tracks that end hereabouts the one that a hypothesis continues, by odometry: the first. None: the end.
+/// Of the tracks the one that a hypothesis continues, by odometry: the first. None: the end.
 std::vector<BackEnd::Track>::const_iterator BackEnd::FindTrack(RobotIndex index, const Hypothesis& hypothesis) const {
   const std::vector<Track>& tracks = robots_[index].tracks;
   const Eigen::Vector3d place = (PoseOf(hypothesis.target).T_map_sensor * hypothesis.closure.T_target_query).translation();
   return std::find_if(tracks.begin(), tracks.end(), [&](const Track& track) {
-    return !IsOver(index, track) &&
-           (PlaceNow(index, track).translation() - place).norm() <= parameters_.recognizer.same_place_m;
+    return (PlaceNow(index, track).translation() - place).norm() <= parameters_.recognizer.same_place_m;
   });
 }
 
@@ -212,9 +218,6 @@ bool BackEnd::IsOnProvenTrack(RobotIndex robot, const Hypothesis& hypothesis) co
 /// how well the scans have fitted along it, and whether it is proven.
 BackEnd::Track& BackEnd::FollowTrack(RobotIndex index, const Hypothesis& hypothesis, double fit, Evidence* evidence) {
   Robot& robot = robots_[index];
-  robot.tracks.erase(std::remove_if(robot.tracks.begin(), robot.tracks.end(),
-                                    [&](const Track& track) { return IsOver(index, track); }),
-                     robot.tracks.end());
   auto track = robot.tracks.begin() + (FindTrack(index, hypothesis) - robot.tracks.cbegin());
   if (track == robot.tracks.end()) track = robot.tracks.insert(track, Track{});
   track->target = hypothesis.target;

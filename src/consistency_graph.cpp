@@ -258,11 +258,12 @@ SEGMATCH_AVX512 inline std::uint64_t ScreenBlock(const Own512& own, const Screen
                             _CMP_LE_OQ);
 }
 
-/// The same as ScreenPortable, four blocks at a time, and the rest of a range one at a time.
-SEGMATCH_AVX2 std::size_t ScreenAvx2(const ScreenArrays& arrays, std::uint32_t i, const std::vector<Range>& ranges,
-                                     std::uint32_t* hits) {
+/// The same as ScreenPortable, four blocks at a time, and the rest of a range one at a time. Becomes a part of its callers,
+/// which say for what processor it is compiled.
+template <class Own>
+__attribute__((always_inline)) inline std::size_t ScreenRanges(const Own& own, const ScreenArrays& arrays,
+                                                               const std::vector<Range>& ranges, std::uint32_t* hits) {
   constexpr std::uint32_t kBlock = ScreenArrays::kBlock;
-  const Own256 own(arrays, i);
   std::size_t count = 0;
   for (const Range range : ranges) {
     std::uint32_t j = range.begin / kBlock * kBlock;
@@ -283,29 +284,14 @@ SEGMATCH_AVX2 std::size_t ScreenAvx2(const ScreenArrays& arrays, std::uint32_t i
   return count;
 }
 
-/// The same as ScreenPortable, four blocks at a time, and the rest of a range one at a time.
+SEGMATCH_AVX2 std::size_t ScreenAvx2(const ScreenArrays& arrays, std::uint32_t i, const std::vector<Range>& ranges,
+                                     std::uint32_t* hits) {
+  return ScreenRanges(Own256(arrays, i), arrays, ranges, hits);
+}
+
 SEGMATCH_AVX512 std::size_t ScreenAvx512(const ScreenArrays& arrays, std::uint32_t i, const std::vector<Range>& ranges,
                                          std::uint32_t* hits) {
-  constexpr std::uint32_t kBlock = ScreenArrays::kBlock;
-  const Own512 own(arrays, i);
-  std::size_t count = 0;
-  for (const Range range : ranges) {
-    std::uint32_t j = range.begin / kBlock * kBlock;
-    std::uint64_t valid = ~std::uint64_t{0} << (range.begin - j);
-    for (; j + 4 * kBlock <= range.end; j += 4 * kBlock) {
-      const ScreenArrays::Block* const block = &arrays.blocks[j / kBlock];
-      const std::uint64_t mask = ScreenBlock(own, block[0]) | ScreenBlock(own, block[1]) << kBlock |
-                                 ScreenBlock(own, block[2]) << 2 * kBlock | ScreenBlock(own, block[3]) << 3 * kBlock;
-      count = AppendBits(mask & valid, j, hits, count);
-      valid = ~std::uint64_t{0};
-    }
-    for (; j < range.end; j += kBlock) {
-      if (range.end - j < kBlock) valid &= (std::uint64_t{1} << (range.end - j)) - 1;
-      count = AppendBits(ScreenBlock(own, arrays.blocks[j / kBlock]) & valid, j, hits, count);
-      valid = ~std::uint64_t{0};
-    }
-  }
-  return count;
+  return ScreenRanges(Own512(arrays, i), arrays, ranges, hits);
 }
 #endif
 

@@ -495,23 +495,25 @@ struct RefinementTarget::Impl {
     return fit;
   }
 
+  /// Share of the local points, both relative to their centers, that have a partner.
+  double Overlap(const std::vector<Eigen::Vector3f>& local, const Pose& T) const {
+    const std::vector<std::uint32_t> partners =
+        FindPartners(local, T, fine.cells(), static_cast<float>(parameters.min_distance_m));
+    const auto alone = std::count(partners.begin(), partners.end(), kNone);
+    return 1.0 - static_cast<double>(alone) / static_cast<double>(partners.size());
+  }
+
   /// Of a grid of places around one, along x and y, that where most points have a partner; nothing if it is hardly better than
   /// the one in the middle.
   std::optional<Pose> Search(const std::vector<Eigen::Vector3f>& local, const Pose& T_middle) const {
-    const auto overlap = [&](const Pose& T) {
-      const std::vector<std::uint32_t> partners =
-          FindPartners(local, T, fine.cells(), static_cast<float>(parameters.min_distance_m));
-      const auto alone = std::count(partners.begin(), partners.end(), kNone);
-      return 1.0 - static_cast<double>(alone) / static_cast<double>(partners.size());
-    };
-    double best = overlap(T_middle) + kSearchGain;
+    double best = Overlap(local, T_middle) + kSearchGain;
     std::optional<Pose> best_T;
     const double step_m = kSearchStep * parameters.max_distance_m;
     const int steps = static_cast<int>(parameters.search_m / step_m);
     for (int x = -steps; x <= steps; ++x) {
       for (int y = -steps; y <= steps; ++y) {
         const Pose T = Eigen::Translation3d(step_m * x, step_m * y, 0.0) * T_middle;
-        const double there = overlap(T);
+        const double there = Overlap(local, T);
         if (there <= best) continue;
         best = there;
         best_T = T;
@@ -588,11 +590,7 @@ double RefinementTarget::Overlap(const std::vector<Eigen::Vector3d>& points_loca
   const std::vector<Eigen::Vector3f> local =
       Thin(Center(points_local, Eigen::Vector3d::Zero()), impl_->parameters.max_points);
   if (local.empty()) return 0.0;
-  const std::vector<std::uint32_t> partners =
-      FindPartners(local, Eigen::Translation3d(-impl_->center) * T_target_local, impl_->fine.cells(),
-                   static_cast<float>(impl_->parameters.min_distance_m));
-  const auto alone = std::count(partners.begin(), partners.end(), kNone);
-  return 1.0 - static_cast<double>(alone) / static_cast<double>(partners.size());
+  return impl_->Overlap(local, Eigen::Translation3d(-impl_->center) * T_target_local);
 }
 
 }  // namespace incremental_segmatch

@@ -285,7 +285,7 @@ class BackEnd {
   static double Distinction(const Hypothesis& first, const Hypothesis& second);
   bool IsBetter(RobotIndex robot, const Hypothesis& first, const Hypothesis& second) const;
   Pose PlaceNow(RobotIndex robot, const Track& track) const;
-  bool IsOver(RobotIndex robot, const Track& track) const;
+  void ForgetTracks(RobotIndex robot);
   std::vector<Track>::const_iterator FindTrack(RobotIndex robot, const Hypothesis& hypothesis) const;
   bool IsOnProvenTrack(RobotIndex robot, const Hypothesis& hypothesis) const;
   Track& FollowTrack(RobotIndex robot, const Hypothesis& hypothesis, double fit, Evidence* evidence);

@@ -53,8 +53,8 @@ class LoopCloser {
       : parameters_(parameters), graph_(parameters.pose_graph) {}
 
   void AddPose(const StampedPose& odometry) {
-    if (!path_m_.empty()) travelled_m_ += (odometry.T_frame_sensor.translation() - last_position_).norm();
-    path_m_.push_back(travelled_m_);
+    path_m_.push_back(path_m_.empty() ? 0.0
+                                      : path_m_.back() + (odometry.T_frame_sensor.translation() - last_position_).norm());
     last_position_ = odometry.T_frame_sensor.translation();
     graph_.AddNode(kRobot, odometry.stamp_ns, odometry.T_frame_sensor);
   }
@@ -73,7 +73,7 @@ class LoopCloser {
 
   // Optimizes and corrects the back end's map if it is time to. True if it did.
   bool CorrectIfDue(BackEnd& back_end) {
-    if (!has_new_closure_ || travelled_m_ - last_optimization_m_ < parameters_.optimization_spacing_m) return false;
+    if (!has_new_closure_ || path_m_.back() - last_optimization_m_ < parameters_.optimization_spacing_m) return false;
     Optimize();
     back_end.CorrectTrajectory(parameters_.robot, graph_.Trajectory(kRobot));
     return true;
@@ -81,7 +81,7 @@ class LoopCloser {
 
   void Optimize() {
     report_ = graph_.Optimize();
-    last_optimization_m_ = travelled_m_;
+    last_optimization_m_ = path_m_.back();
     has_new_closure_ = false;
   }
 
@@ -98,7 +98,6 @@ class LoopCloser {
   std::vector<double> path_m_;  // at each step
   bool has_new_closure_ = false;
   Eigen::Vector3d last_position_ = Eigen::Vector3d::Zero();
-  double travelled_m_ = 0.0;
   double last_closure_m_ = kLongAgo;
   double last_optimization_m_ = kLongAgo;
 };

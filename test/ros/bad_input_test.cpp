@@ -519,10 +519,3 @@ TEST_F(BadInput, WrongParametersAreFatalByNameAndTheManagerLives) {
 
 }  // namespace
 }  // namespace incremental_segmatch
-
-int main(int argc, char** argv) {
-  testing::InitGoogleTest(&argc, argv);
-  ros::init(argc, argv, "bad_input_test");
-  ros::NodeHandle nh;  // keeps the node alive between tests
-  return RUN_ALL_TESTS();
-}

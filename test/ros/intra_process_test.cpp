@@ -141,10 +141,3 @@ TEST_F(IntraProcess, UnderOverloadTheNewestIsKept) {
 
 }  // namespace
 }  // namespace incremental_segmatch
-
-int main(int argc, char** argv) {
-  testing::InitGoogleTest(&argc, argv);
-  ros::init(argc, argv, "intra_process_test");
-  ros::NodeHandle nh;  // keeps the node alive between tests
-  return RUN_ALL_TESTS();
-}

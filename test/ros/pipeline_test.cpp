@@ -218,10 +218,3 @@ TEST_F(Pipeline, SavedMapLocalizesTheRobot) {
 
 }  // namespace
 }  // namespace incremental_segmatch
-
-int main(int argc, char** argv) {
-  testing::InitGoogleTest(&argc, argv);
-  ros::init(argc, argv, "pipeline_test");
-  ros::NodeHandle nh;  // keeps the node alive between tests
-  return RUN_ALL_TESTS();
-}

@@ -101,10 +101,3 @@ TEST(Settled, ClosuresArePublishedWithTheOneThatSettlesThem) {
 
 }  // namespace
 }  // namespace incremental_segmatch
-
-int main(int argc, char** argv) {
-  testing::InitGoogleTest(&argc, argv);
-  ros::init(argc, argv, "settled_test");
-  ros::NodeHandle nh;  // keeps the node alive between tests
-  return RUN_ALL_TESTS();
-}

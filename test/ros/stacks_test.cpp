@@ -229,10 +229,3 @@ TEST_F(Stacks, CorrectedOdometryMovesTheMap) {
 
 }  // namespace
 }  // namespace incremental_segmatch
-
-int main(int argc, char** argv) {
-  testing::InitGoogleTest(&argc, argv);
-  ros::init(argc, argv, "stacks_test");
-  ros::NodeHandle nh;  // keeps the node alive between tests
-  return RUN_ALL_TESTS();
-}
