@@ -8,7 +8,7 @@ if [[ ${1:-} == --help || ${1:-} == -h ]]; then
   exit 0
 fi
 mkdir -p "$root/build/benchmark"
-programs=(voxel_grid_benchmark normals_benchmark segmentation_benchmark recognition_benchmark)
+programs=(voxel_grid_benchmark normals_benchmark segmentation_benchmark matching_benchmark recognition_benchmark)
 [[ -f $root/build/Makefile ]] || "$root/scripts/build.sh"
 make -C "$root/build" --no-print-directory "${programs[@]}" >/dev/null
 for program in "${programs[@]}"; do

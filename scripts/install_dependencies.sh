@@ -9,7 +9,7 @@ Usage: install_dependencies.sh [--benchmark] [--docs] [--pictures] [--tools] [--
 Installs the packages that are missing for building, the tests, the demo and rviz. Needs root or sudo only where
 something is missing. Recommended packages are not installed.
 
-  --benchmark  also for the benchmarks (google-benchmark)
+  --benchmark  also for the benchmarks (google-benchmark, FLANN)
   --docs       also for the target `docs` (Doxygen)
   --pictures   also for pictures of rviz without a display (ImageMagick)
   --tools      also clang-format and clang-tidy
@@ -39,7 +39,7 @@ fi
 
 packages=(
   build-essential cmake pkg-config python3
-  libceres-dev libcli11-dev libeigen3-dev libflann-dev libgtest-dev libpcl-dev libyaml-cpp-dev nlohmann-json3-dev
+  libceres-dev libcli11-dev libeigen3-dev libgtest-dev libpcl-dev libyaml-cpp-dev nlohmann-json3-dev
   libgl1-mesa-dri xvfb  # a test starts rviz
 )
 case "$system" in
@@ -73,7 +73,7 @@ case "$system" in
 install_dependencies.sh: this system ($system) is none that the script knows (Debian 12; Ubuntu 20.04, untried).
 Install these yourself, then run cmake:
   a C++17 compiler, CMake 3.16, pkg-config, Python 3
-  Eigen 3.3, yaml-cpp, FLANN, PCL 1.10, Ceres Solver 2.1, CLI11, nlohmann-json, GoogleTest
+  Eigen 3.3, yaml-cpp, PCL 1.10, Ceres Solver 2.1, CLI11, nlohmann-json, GoogleTest
   for the nodelets and bags, ROS 1: catkin, roscpp, nodelet, pluginlib, rosbag, tf2, tf2_ros, tf2_eigen, tf2_msgs,
   diagnostic_updater, dynamic_reconfigure, message_generation, std_msgs, std_srvs, geometry_msgs, nav_msgs,
   sensor_msgs, visualization_msgs, diagnostic_msgs, rostest, roslaunch, rviz
@@ -81,7 +81,7 @@ MESSAGE
     exit 1
     ;;
 esac
-if $benchmark; then packages+=(libbenchmark-dev); fi
+if $benchmark; then packages+=(libbenchmark-dev libflann-dev); fi
 if $docs; then packages+=(doxygen graphviz); fi
 if $pictures; then packages+=(imagemagick); fi
 if $tools; then packages+=(clang-format clang-tidy); fi

@@ -5,7 +5,6 @@
 #include <stdexcept>
 #include <string>
 #include <tuple>
-#include <unordered_set>
 #include <utility>
 
 namespace incremental_segmatch {
@@ -25,7 +24,7 @@ void TargetIndex::Open(const SegmentKey& segment, const TargetMap& map, std::siz
       items.erase(present);
     }
     const SegmentView& taken = target->views[view];
-    Insert({segment, view, taken.robot, taken.descriptor, map.CentroidMap(taken), true, is_released});
+    Insert({segment, view, taken.robot, true, is_released, taken.descriptor, map.CentroidMap(taken)});
   }
   if (!index_) return;
   if (index_->size() >= rescale_at_) {
@@ -60,27 +59,37 @@ std::vector<TargetCandidate> TargetIndex::Nearest(const Descriptor& query, Robot
                                                   float max_distance, const std::vector<TargetCandidate>& known) const {
   if (!index_) return {};
   RequireSize(query);
-  const Descriptor scaled = query.cwiseProduct(weights_);
-  const float radius = std::min(max_distance, FarthestOf(known, query, robot, count));
-  // Several of the nearest views may belong to one segment, or be closed to the robot: look on until there are enough
-  // segments.
-  for (std::size_t wanted = count == 0 ? index_->size() : 2 * count;; wanted *= 2) {
-    const std::vector<DescriptorMatch> matches = index_->Nearest(scaled, wanted, radius);
-    std::unordered_set<SegmentKey, SegmentKeyHash> seen;
-    std::vector<TargetCandidate> candidates;
-    for (const DescriptorMatch& match : matches) {
-      const SegmentKey& segment = views_[match.item].segment;
-      if (IsOpen(match.item, robot) && seen.insert(segment).second)
-        candidates.push_back({match.item, segment, match.distance});
+  std::vector<TargetCandidate> candidates;
+  float radius = std::min(max_distance, FarthestOf(known, query, robot, count));
+  index_->Search(query.cwiseProduct(weights_), radius, [&](std::uint64_t item, float distance) {
+    __builtin_prefetch(&views_[item]);
+    candidates.push_back({item, SegmentKey(), distance});
+    if (count != 0 && candidates.size() >= 4 * count) {
+      KeepNearest(robot, count, &candidates);
+      if (candidates.size() == count) radius = candidates.back().distance;
     }
-    const bool exhausted = matches.size() < wanted || wanted >= index_->size();
-    if (!exhausted && candidates.size() < count) continue;
-    std::sort(candidates.begin(), candidates.end(), [](const TargetCandidate& a, const TargetCandidate& b) {
-      return std::tie(a.distance, a.segment) < std::tie(b.distance, b.segment);
-    });
-    if (count != 0 && candidates.size() > count) candidates.resize(count);
-    return candidates;
-  }
+    return radius;
+  });
+  KeepNearest(robot, count, &candidates);
+  return candidates;
+}
+
+/// Leaves the most alike view of each segment, of those that are open to the robot, and of them the `count` nearest (0:
+/// all), by ascending (distance, segment). Fills in the segments.
+void TargetIndex::KeepNearest(RobotIndex robot, std::size_t count, std::vector<TargetCandidate>* candidates) const {
+  const auto closed = [&](const TargetCandidate& c) { return !IsOpen(c.item, robot); };
+  candidates->erase(std::remove_if(candidates->begin(), candidates->end(), closed), candidates->end());
+  for (TargetCandidate& candidate : *candidates) candidate.segment = views_[candidate.item].segment;
+
+  std::sort(candidates->begin(), candidates->end(), [](const TargetCandidate& a, const TargetCandidate& b) {
+    return std::tie(a.segment, a.distance, a.item) < std::tie(b.segment, b.distance, b.item);
+  });
+  const auto same = [](const TargetCandidate& a, const TargetCandidate& b) { return a.segment == b.segment; };
+  candidates->erase(std::unique(candidates->begin(), candidates->end(), same), candidates->end());
+  std::sort(candidates->begin(), candidates->end(), [](const TargetCandidate& a, const TargetCandidate& b) {
+    return std::tie(a.distance, a.segment) < std::tie(b.distance, b.segment);
+  });
+  if (count != 0 && candidates->size() > count) candidates->resize(count);
 }
 
 void TargetIndex::RequireSize(const Descriptor& descriptor) const {

@@ -1,51 +1,80 @@
 /// \file
-/// Nearest neighbours over descriptors, with insertion and removal and without rebuilding (METHOD 4; FLANN inside).
+/// Which descriptors lie near one, over a set that changes (METHOD 4: matching).
 #pragma once
 
+#include <array>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
-#include <memory>
-#include <optional>
+#include <limits>
+#include <string>
+#include <unordered_map>
 #include <vector>
 
 #include "incremental_segmatch/descriptors.hpp"
 
 namespace incremental_segmatch {
 
-/// An item near a query.
-struct DescriptorMatch {
-  std::uint64_t item = 0;  ///< as numbered at insertion
-  float distance = 0.f;    ///< Euclidean
-};
-
-/// Exact k-nearest and radius search over a changing set of points. A logarithmic forest: static FLANN k-d trees of
-/// doubling sizes, a small buffer searched directly, removed items skipped until half of a tree is dead. Insertion and
-/// removal cost O(log^2 n) amortised; a query that of O(log n) trees. Not thread-safe.
+/// Exact search over a changing set of points: all of them are looked at, sixteen at a time, in blocks that hold the same
+/// value of sixteen items side by side. In as many dimensions as descriptors have, a tree looks at most of what it holds
+/// as well, one by one. Insertion and removal cost O(dimensions), a search O(items * dimensions). Not thread-safe.
 class DescriptorIndex {
  public:
   /// Throws std::invalid_argument if there are no dimensions.
   explicit DescriptorIndex(std::size_t dimensions);
-  ~DescriptorIndex();
-  /// Moves; what was moved from can only be assigned to or destroyed.
-  DescriptorIndex(DescriptorIndex&&) noexcept;
-  /// Moves likewise.
-  DescriptorIndex& operator=(DescriptorIndex&&) noexcept;
 
   /// Throws std::invalid_argument on a wrong dimension, a value that is not finite, or an item that is there already.
   void Insert(std::uint64_t item, const Descriptor& descriptor);
   /// False if there is no such item.
   bool Remove(std::uint64_t item);
   /// Number of items.
-  std::size_t size() const;
+  std::size_t size() const { return items_.size(); }
 
-  /// The `count` nearest items among those within `radius` (infinity: no limit), by ascending (distance, item),
-  /// whatever the order of insertions and removals. Throws std::invalid_argument on a wrong dimension or a value that
-  /// is not finite.
-  std::vector<DescriptorMatch> Nearest(const Descriptor& query, std::size_t count, float radius) const;
+  /// Calls `float visit(std::uint64_t item, float distance)` for the items within a Euclidean distance (infinity: all),
+  /// in no particular order; it returns the radius that holds from then on, which may be smaller. Throws
+  /// std::invalid_argument on a wrong dimension or a value that is not finite.
+  template <class Visit>
+  void Search(const Descriptor& query, float radius, Visit&& visit) const;
 
  private:
-  class Impl;
-  std::unique_ptr<Impl> impl_;
+  static constexpr std::size_t kBlock = 16;  ///< items
+  /// One value of each item in a block: a cache line.
+  struct alignas(64) Lanes {
+    std::array<float, kBlock> values;
+  };
+
+  void RequireValid(const Descriptor& descriptor, const std::string& what) const;
+  std::size_t FindNear(const Descriptor& query, float square_bound, std::size_t block, Lanes* squares) const;
+
+  /// No square of a distance within the radius is larger, whatever root and square are rounded to.
+  static float SquareBound(float radius) {
+    constexpr float kMargin = 1e-5f;
+    return radius * radius * (1.f + kMargin) + std::numeric_limits<float>::min();
+  }
+
+  std::size_t dimensions_;
+  std::vector<Lanes> lanes_;          ///< block after block, `dimensions_` each; the last one may have room
+  std::vector<std::uint64_t> items_;  ///< in the order of the blocks
+  std::unordered_map<std::uint64_t, std::size_t> places_;  ///< index of an item in items_
 };
+
+template <class Visit>
+void DescriptorIndex::Search(const Descriptor& query, float radius, Visit&& visit) const {
+  RequireValid(query, "a query");
+  float square_bound = SquareBound(radius);
+  Lanes squares;
+  for (std::size_t block = 0;; ++block) {
+    block = FindNear(query, square_bound, block, &squares);
+    const std::size_t first = block * kBlock;
+    if (first >= items_.size()) return;
+    for (std::size_t i = 0; i < kBlock && first + i < items_.size(); ++i) {
+      if (!(squares.values[i] <= square_bound)) continue;
+      const float distance = std::sqrt(squares.values[i]);
+      if (!(distance <= radius)) continue;
+      radius = visit(items_[first + i], distance);
+      square_bound = SquareBound(radius);
+    }
+  }
+}
 
 }  // namespace incremental_segmatch

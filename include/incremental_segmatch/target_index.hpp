@@ -18,10 +18,10 @@ struct IndexedView {
   SegmentKey segment;                                      ///< whose view it is
   std::uint32_t view = 0;                                  ///< index among the segment's views
   RobotIndex robot = 0;                                    ///< who took it
-  Descriptor descriptor;                                   ///< unscaled
-  Eigen::Vector3d centroid_map = Eigen::Vector3d::Zero();  ///< in the map (m), at the time of insertion
   bool live = false;                                       ///< false once its segment was closed
   bool released = false;                                   ///< open to that robot as well, not only to others
+  Descriptor descriptor;                                   ///< unscaled
+  Eigen::Vector3d centroid_map = Eigen::Vector3d::Zero();  ///< in the map (m), at the time of insertion
 };
 
 /// A target segment that looks like a local one, by its most alike view.
@@ -72,6 +72,7 @@ class TargetIndex {
   void RequireSize(const Descriptor& descriptor) const;
   float FarthestOf(const std::vector<TargetCandidate>& known, const Descriptor& query, RobotIndex robot,
                    std::size_t count) const;
+  void KeepNearest(RobotIndex robot, std::size_t count, std::vector<TargetCandidate>* candidates) const;
   void Insert(IndexedView view);
   void Erase(std::uint64_t item);
   void Rescale();
