@@ -9,6 +9,7 @@
 
 #include "incremental_segmatch/stage_times.hpp"
 #include "radix_sort.hpp"
+#include "truss.hpp"
 
 #if defined(__GNUC__) && defined(__x86_64__)
 #define SEGMATCH_HAS_AVX_KERNELS
@@ -332,14 +333,15 @@ class Partition {
   /// Index of the match in the list that was assigned.
   std::uint32_t index(std::uint32_t slot) const { return order_[slot]; }
 
-  /// Calls visit(slot, slot) once for each unordered pair that passes the screen; returns the number of pairs screened.
+  /// Calls visit(slot, begin, end) for each slot, with those later ones that pass the screen: every unordered pair once.
+  /// Returns the number of pairs screened.
   template <typename Visit>
-  std::uint64_t ForEachPair(Visit visit);
+  std::uint64_t ForEachLater(Visit visit);
 
-  /// Calls visit(slot, other) for each other match that passes the screen, for those slots for which selected(slot);
-  /// returns the number of pairs screened.
+  /// Calls visit(slot, begin, end) for those slots for which selected(slot), with all that pass the screen, the slot itself
+  /// among them. Returns the number of pairs screened.
   template <typename Selected, typename Visit>
-  std::uint64_t ForEachPairOf(Selected selected, Visit visit);
+  std::uint64_t ForEachOf(Selected selected, Visit visit);
 
  private:
   using Index = std::int64_t;  ///< of a cell along an axis
@@ -518,14 +520,14 @@ Range Partition::RangeIn(const NearRow& near, const Row& own, std::uint32_t slot
 template <typename Visit>
 std::uint64_t Partition::Screen(std::uint32_t slot, const std::vector<Range>& ranges, Visit& visit) {
   const std::size_t count = screen_(arrays_, slot, ranges, hits_.data());
-  for (std::size_t k = 0; k < count; ++k) visit(slot, hits_[k]);
+  visit(slot, hits_.data(), hits_.data() + count);
   std::uint64_t screened = 0;
   for (const Range range : ranges) screened += range.end - range.begin;
   return screened;
 }
 
 template <typename Visit>
-std::uint64_t Partition::ForEachPair(Visit visit) {
+std::uint64_t Partition::ForEachLater(Visit visit) {
   std::uint64_t screened = 0;
   std::vector<Range> ranges;
   for (const Row& row : rows_) {
@@ -544,7 +546,7 @@ std::uint64_t Partition::ForEachPair(Visit visit) {
 }
 
 template <typename Selected, typename Visit>
-std::uint64_t Partition::ForEachPairOf(Selected selected, Visit visit) {
+std::uint64_t Partition::ForEachOf(Selected selected, Visit visit) {
   std::uint64_t screened = 0;
   std::vector<Range> ranges;
   for (const Row& row : rows_) {
@@ -568,7 +570,8 @@ class Cache {
   explicit Cache(const ConsistencyParameters& parameters)
       : parameters_(parameters), partition_(parameters.instructions) {}
 
-  ConsistencyGraph Build(const Correspondences& correspondences);
+  /// Appends the pairs; returns how many were tested.
+  std::uint64_t FindPairs(const Correspondences& correspondences, std::vector<ConsistencyGraph::Edge>& edges);
 
  private:
   /// An older tracked correspondence that may become consistent with the owner of the list.
@@ -613,15 +616,12 @@ bool KeyLess(const Match& a, const Match& b) {
   return std::tie(a.local_key, a.target_key) < std::tie(b.local_key, b.target_key);
 }
 
-ConsistencyGraph Cache::Build(const Correspondences& correspondences) {
+std::uint64_t Cache::FindPairs(const Correspondences& correspondences, std::vector<ConsistencyGraph::Edge>& edges) {
   tested_pairs_ = 0;
   Follow(correspondences);
-  std::vector<ConsistencyGraph::Edge> edges;
   TestKnownCandidates(edges);
   FindNewCandidates(edges);
-  ConsistencyGraph graph = ConsistencyGraph::FromEdges(correspondences.size(), edges);
-  graph.tested_pairs = tested_pairs_;
-  return graph;
+  return tested_pairs_;
 }
 
 /// Joins the sorted keys of the last step with those of this one: what is in both goes on, the others leave or enter.
@@ -737,7 +737,7 @@ void Cache::FindNewCandidates(std::vector<ConsistencyGraph::Edge>& edges) {
   const double tolerance_m = parameters_.cache_theta_m + parameters_.epsilon_m + kRounding_m;
   partition_.Assign(anchors, tolerance_m, Layout::kSquares);
   const auto is_new = [&](std::uint32_t slot) { return states_[sorted_[partition_.index(slot)]].is_new == 1; };
-  tested_pairs_ += partition_.ForEachPairOf(is_new, [&](std::uint32_t slot, std::uint32_t other_slot) {
+  const auto visit = [&](std::uint32_t slot, std::uint32_t other_slot) {
     if (other_slot == slot || (other_slot > slot && is_new(other_slot))) return;  // new pairs once
     const Match& own = partition_.match(slot);
     const Match& other = partition_.match(other_slot);
@@ -748,7 +748,11 @@ void Cache::FindNewCandidates(std::vector<ConsistencyGraph::Edge>& edges) {
     Test(own, 0.0, candidate);
     if (candidate.consistent) edges.emplace_back(states_[index].vertex, states_[other_index].vertex);
     tracks_[index].candidates.push_back(candidate);
-  });
+  };
+  tested_pairs_ +=
+      partition_.ForEachOf(is_new, [&](std::uint32_t slot, const std::uint32_t* first, const std::uint32_t* last) {
+        for (; first != last; ++first) visit(slot, *first);
+      });
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -855,68 +859,71 @@ class ConsistencyGraphBuilder::Impl {
   explicit Impl(const ConsistencyParameters& parameters)
       : parameters_(parameters), partition_(parameters.instructions), cache_(parameters) {}
 
-  ConsistencyGraph Build(const Correspondences& correspondences) {
-    return parameters_.method == ConsistencyMethod::kAuto ? BuildWithFastest(correspondences)
-                                                          : BuildWith(parameters_.method, correspondences);
+  ConsistentPairs FindPairs(const Correspondences& correspondences, std::size_t set_size) {
+    ConsistencyMethod method = parameters_.method;
+    if (method == ConsistencyMethod::kAuto) method = chooser_.Next(correspondences.size());
+    const double start_ms = ThreadCpuMs();
+    ConsistentPairs found;
+    if (method == ConsistencyMethod::kCached) {
+      found.tested_pairs = cache_.FindPairs(correspondences, found.pairs);
+      truss_finder_.DropByBound(correspondences.size(), set_size, &found.pairs);
+      truss_finder_.DropByCount(correspondences.size(), set_size, &found.pairs);
+    } else {
+      FindPartitioned(correspondences, set_size, LayoutOf(method), found);
+    }
+    chooser_.Report(method, (ThreadCpuMs() - start_ms) / static_cast<double>(correspondences.size() + 1));
+    return found;
   }
 
  private:
-  ConsistencyGraph BuildWith(ConsistencyMethod method, const Correspondences& correspondences) {
-    switch (method) {
-      case ConsistencyMethod::kCached:
-        return cache_.Build(correspondences);
-      case ConsistencyMethod::kPartitioned2D:
-        return BuildPartitioned(correspondences, Layout::kSquares);
-      case ConsistencyMethod::kPartitioned3D:
-        return BuildPartitioned(correspondences, Layout::kCubes);
-      default:
-        return BuildPartitioned(correspondences, Layout::kOneCell);
-    }
+  static Layout LayoutOf(ConsistencyMethod method) {
+    if (method == ConsistencyMethod::kPartitioned2D) return Layout::kSquares;
+    return method == ConsistencyMethod::kPartitioned3D ? Layout::kCubes : Layout::kOneCell;
   }
 
-  ConsistencyGraph BuildPartitioned(const Correspondences& correspondences, Layout layout) {
-    matches_.clear();
-    vertices_.clear();
-    for (std::uint32_t v = 0; v < correspondences.size(); ++v) {
-      const Match match = MakeMatch(correspondences[v]);
-      if (!IsUsable(match)) continue;
-      matches_.push_back(match);
-      vertices_.push_back(v);
-    }
-    partition_.Assign(matches_, parameters_.epsilon_m, layout);
-    vertex_of_slot_.clear();
-    for (std::uint32_t slot = 0; slot < partition_.size(); ++slot) {
-      vertex_of_slot_.push_back(vertices_[partition_.index(slot)]);
-    }
-    edges_.clear();
-    const std::uint64_t tested = partition_.ForEachPair([&](std::uint32_t a, std::uint32_t b) {
-      if (Consistent(partition_.match(a), partition_.match(b), parameters_.epsilon_m, parameters_.max_vertical_slope)) {
-        edges_.emplace_back(vertex_of_slot_[a], vertex_of_slot_[b]);
-      }
-    });
-    ConsistencyGraph graph = ConsistencyGraph::FromEdges(correspondences.size(), edges_);
-    graph.tested_pairs = tested;
-    return graph;
-  }
-
-  ConsistencyGraph BuildWithFastest(const Correspondences& correspondences);
+  void FindPartitioned(const Correspondences& correspondences, std::size_t set_size, Layout layout,
+                       ConsistentPairs& found);
 
   ConsistencyParameters parameters_;
-  std::vector<Match> matches_;                 ///< of the last call, as what follows: memory that the next one reuses
-  std::vector<std::uint32_t> vertices_;        ///< of the matches
-  std::vector<std::uint32_t> vertex_of_slot_;  ///< the same in the partition's order
-  std::vector<ConsistencyGraph::Edge> edges_;
+  std::vector<Match> matches_;          ///< of the last call, as what follows: memory that the next one reuses
+  std::vector<std::uint32_t> indices_;  ///< of the matches among the correspondences
+  std::vector<ConsistencyGraph::Edge> slots_;  ///< of the partition, that may be a pair
   Partition partition_;
   Cache cache_;
+  TrussFinder truss_finder_;
   MethodChooser chooser_;
 };
 
-ConsistencyGraph ConsistencyGraphBuilder::Impl::BuildWithFastest(const Correspondences& correspondences) {
-  const ConsistencyMethod method = chooser_.Next(correspondences.size());
-  const double start_ms = ThreadCpuMs();
-  ConsistencyGraph graph = BuildWith(method, correspondences);
-  chooser_.Report(method, (ThreadCpuMs() - start_ms) / static_cast<double>(correspondences.size() + 1));
-  return graph;
+/// By slot, what is near each other in the target map is near each other in memory. The predicate decides late, on the few
+/// pairs that enough others support even if all that pass the screen were consistent.
+void ConsistencyGraphBuilder::Impl::FindPartitioned(const Correspondences& correspondences, std::size_t set_size,
+                                                    Layout layout, ConsistentPairs& found) {
+  matches_.clear();
+  indices_.clear();
+  for (std::uint32_t i = 0; i < correspondences.size(); ++i) {
+    const Match match = MakeMatch(correspondences[i]);
+    if (!IsUsable(match)) continue;
+    matches_.push_back(match);
+    indices_.push_back(i);
+  }
+  partition_.Assign(matches_, parameters_.epsilon_m, layout);
+  slots_.clear();
+  found.tested_pairs =
+      partition_.ForEachLater([&](std::uint32_t slot, const std::uint32_t* first, const std::uint32_t* last) {
+        auto* pair = &*slots_.insert(slots_.end(), static_cast<std::size_t>(last - first), {slot, slot});
+        for (; first != last; ++first, ++pair) pair->second = *first;
+      });
+  truss_finder_.DropByBound(partition_.size(), set_size, &slots_);
+  const auto inconsistent = [&](const ConsistencyGraph::Edge& pair) {
+    return !Consistent(partition_.match(pair.first), partition_.match(pair.second), parameters_.epsilon_m,
+                       parameters_.max_vertical_slope);
+  };
+  slots_.erase(std::remove_if(slots_.begin(), slots_.end(), inconsistent), slots_.end());
+  truss_finder_.DropByCount(partition_.size(), set_size, &slots_);
+  found.pairs.reserve(slots_.size());
+  for (const auto& [a, b] : slots_) {
+    found.pairs.emplace_back(indices_[partition_.index(a)], indices_[partition_.index(b)]);
+  }
 }
 
 ConsistencyGraphBuilder::ConsistencyGraphBuilder(const ConsistencyParameters& parameters) {
@@ -927,8 +934,12 @@ ConsistencyGraphBuilder::~ConsistencyGraphBuilder() = default;
 ConsistencyGraphBuilder::ConsistencyGraphBuilder(ConsistencyGraphBuilder&&) noexcept = default;
 ConsistencyGraphBuilder& ConsistencyGraphBuilder::operator=(ConsistencyGraphBuilder&&) noexcept = default;
 
+ConsistentPairs ConsistencyGraphBuilder::FindPairs(const Correspondences& correspondences, std::size_t set_size) {
+  return impl_->FindPairs(correspondences, set_size);
+}
+
 ConsistencyGraph ConsistencyGraphBuilder::Build(const Correspondences& correspondences) {
-  return impl_->Build(correspondences);
+  return ConsistencyGraph::FromEdges(correspondences.size(), FindPairs(correspondences, 2).pairs);
 }
 
 }  // namespace incremental_segmatch

@@ -9,12 +9,7 @@
 #include <stdexcept>
 #include <utility>
 
-// Compiled for processors that count bits in one instruction as well, and chosen at run time; the results are the same.
-#if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__gnu_linux__)
-#define SEGMATCH_SEVERAL_TARGETS __attribute__((target_clones("popcnt", "default")))
-#else
-#define SEGMATCH_SEVERAL_TARGETS
-#endif
+#include "truss.hpp"
 
 namespace incremental_segmatch {
 namespace {
@@ -285,127 +280,24 @@ NamedGraph Subgraph(const ConsistencyGraph& graph, Keep keep) {
   return {std::move(subgraph), std::move(names)};
 }
 
-/// The core of some order: each of its vertices has as many neighbours among them.
-NamedGraph CoreOf(const ConsistencyGraph& whole, std::size_t order) {
-  // Most vertices of a sparse graph have too low a degree: without them the rest is cheap.
-  NamedGraph core = Subgraph(whole, [&](std::uint32_t v) { return whole.Neighbours(v).size() >= order; });
-  Vertices degree, leaving;
-  for (std::uint32_t v = 0; v < core.graph.vertices(); ++v) {
-    degree.push_back(static_cast<std::uint32_t>(core.graph.Neighbours(v).size()));
-    if (degree[v] < order) leaving.push_back(v);
-  }
-  if (leaving.empty()) return core;
-  while (!leaving.empty()) {
-    const std::uint32_t v = leaving.back();
-    leaving.pop_back();
-    for (const std::uint32_t u : core.graph.Neighbours(v)) {
-      if (degree[u]-- == order) leaving.push_back(u);  // not if it is on its way already
-    }
-  }
-  NamedGraph inner = Subgraph(core.graph, [&](std::uint32_t v) { return degree[v] >= order; });
-  for (std::uint32_t& name : inner.names) name = core.names[name];
-  return inner;
-}
-
-/// The neighbours of each vertex, folded into one cache line: neighbour u sets bit u modulo its size. Bits that two
-/// sketches have in common, and the hidden neighbours of one of the two, bound the common neighbours.
-struct Sketches {
-  using Bits = std::array<Word, 8>;
-  static constexpr std::size_t kBits = std::tuple_size<Bits>::value * kWordBits;
-
-  std::vector<Bits> bits;
-  Vertices hidden;  ///< neighbours whose bit another one of the same vertex had set
-
-  std::size_t MostInCommon(std::uint32_t a, std::uint32_t b) const {
-    std::size_t common = std::min(hidden[a], hidden[b]);
-    for (std::size_t w = 0; w < bits[a].size(); ++w) common += CountBits(bits[a][w] & bits[b][w]);
-    return common;
-  }
-};
-
-SEGMATCH_SEVERAL_TARGETS
-Sketches SketchesOf(const ConsistencyGraph& graph) {
-  Sketches sketches;
-  sketches.bits.reserve(graph.vertices());
-  sketches.hidden.reserve(graph.vertices());
+/// Without edges that are in no clique of `size` vertices; nothing where none is known to be.
+std::optional<NamedGraph> WithoutUnsupportedEdges(const ConsistencyGraph& graph, std::size_t size, TrussFinder* finder) {
+  TrussFinder::Edges edges;
+  edges.reserve(graph.edges);
   for (std::uint32_t v = 0; v < graph.vertices(); ++v) {
-    Sketches::Bits bits{};
-    for (const std::uint32_t u : graph.Neighbours(v)) Set(bits.data(), u % Sketches::kBits);
-    std::size_t set = 0;
-    for (const Word word : bits) set += CountBits(word);
-    sketches.bits.push_back(bits);
-    sketches.hidden.push_back(static_cast<std::uint32_t>(graph.Neighbours(v).size() - set));
+    for (const std::uint32_t u : graph.Neighbours(v))
+      if (v < u) edges.emplace_back(v, u);
   }
-  return sketches;
-}
-
-/// Neighbours with a larger number.
-ConsistencyGraph::Range LaterNeighbours(const ConsistencyGraph& graph, std::uint32_t v) {
-  const ConsistencyGraph::Range all = graph.Neighbours(v);
-  return {std::upper_bound(all.begin(), all.end(), v), all.end()};
-}
-
-/// The edges whose ends have, by the sketches, at least `common` neighbours in common.
-SEGMATCH_SEVERAL_TARGETS
-Edges EdgesByBound(const ConsistencyGraph& graph, const Sketches& sketches, std::size_t common) {
-  Edges edges;
-  for (std::uint32_t v = 0; v < graph.vertices(); ++v) {
-    for (const std::uint32_t u : LaterNeighbours(graph, v))
-      if (sketches.MostInCommon(v, u) >= common) edges.emplace_back(v, u);
-  }
-  return edges;
-}
-
-/// Drops those edges, sorted, whose ends have fewer than `common` neighbours in common.
-void DropByCount(const ConsistencyGraph& graph, std::size_t common, Edges* edges) {
-  std::vector<std::uint8_t> marked(graph.vertices(), 0);
-  const auto has_common = [&](std::uint32_t vertex) {
-    std::size_t count = 0;
-    for (const std::uint32_t u : graph.Neighbours(vertex)) {
-      count += marked[u];
-      if (count == common) return true;
-    }
-    return false;
-  };
-  auto kept = edges->begin();
-  for (auto edge = edges->begin(); edge != edges->end();) {
-    const std::uint32_t v = edge->first;
-    for (const std::uint32_t u : graph.Neighbours(v)) marked[u] = 1;
-    for (; edge != edges->end() && edge->first == v; ++edge)
-      if (has_common(edge->second)) *kept++ = *edge;
-    for (const std::uint32_t u : graph.Neighbours(v)) marked[u] = 0;
-  }
-  edges->erase(kept, edges->end());
-}
-
-/// Whether it takes too long to look at the neighbours of an end of each edge.
-bool IsTooDense(const ConsistencyGraph& graph) {
-  constexpr std::uint64_t kMostStepsPerEdge = 64;
-  std::uint64_t steps = 0;
-  for (std::uint32_t v = 0; v < graph.vertices(); ++v) {
-    const std::uint64_t later = LaterNeighbours(graph, v).size();
-    steps += later * (graph.Neighbours(v).size() - later);
-  }
-  return steps > kMostStepsPerEdge * graph.edges;
-}
-
-/// Without the edges that are in no clique of `size` vertices because an end is in no core of that order, or for lack
-/// of triangles with others (a truss remains), most of them known by their sketches. One pass, O(sum over edges of the
-/// neighbours of an end); nothing where that is too much, or where no edge goes.
-std::optional<NamedGraph> WithoutUnsupportedEdges(const ConsistencyGraph& graph, std::size_t size) {
-  const NamedGraph core = CoreOf(graph, size - 1);
-  if (IsTooDense(core.graph)) return std::nullopt;
-  Edges edges = EdgesByBound(core.graph, SketchesOf(core.graph), size - 2);
-  DropByCount(core.graph, size - 2, &edges);
+  finder->DropByBound(graph.vertices(), size, &edges);
   if (edges.size() == graph.edges) return std::nullopt;
 
   NamedGraph kept;
-  Vertices new_index(core.graph.vertices(), 0);
+  Vertices new_index(graph.vertices(), 0);
   for (const auto& [a, b] : edges) new_index[a] = new_index[b] = 1;
-  for (std::uint32_t v = 0; v < core.graph.vertices(); ++v) {
+  for (std::uint32_t v = 0; v < graph.vertices(); ++v) {
     if (new_index[v] == 0) continue;
     new_index[v] = static_cast<std::uint32_t>(kept.names.size());
-    kept.names.push_back(core.names[v]);
+    kept.names.push_back(v);
   }
   for (auto& [a, b] : edges) {
     a = new_index[a];
@@ -506,6 +398,7 @@ class Finder {
   Vertices best_;                      ///< incumbent in the original graph, sorted
   std::size_t floor_;                  ///< only larger cliques are looked for
   MaxCliqueResult result_;
+  TrussFinder truss_finder_;
   BitGraph bits_;
   Vertices local_index_;  ///< scratch, all 0 between uses: one more than the index in the bit graph
 };
@@ -554,17 +447,13 @@ void Finder::GrowGreedily() {
   }
 }
 
-/// Drops what is in no clique of at least `size` vertices, again and again as long as it pays.
+/// Drops what is in no clique of at least `size` vertices.
 void Finder::KeepCliquesOf(std::size_t size) {
-  for (bool pays = true; pays;) {
-    const std::size_t before = remaining_->edges;
-    std::optional<NamedGraph> kept = WithoutUnsupportedEdges(*remaining_, size);
-    if (!kept) break;
+  if (std::optional<NamedGraph> kept = WithoutUnsupportedEdges(*remaining_, size, &truss_finder_)) {
     for (std::uint32_t& name : kept->names) name = names_[name];
     names_ = std::move(kept->names);
     reduced_ = std::move(kept->graph);
     remaining_ = &reduced_;
-    pays = reduced_.edges > 0 && 4 * reduced_.edges < 3 * before;
   }
   graph_ = CoreGraph(*remaining_, names_, size - 1);
   local_index_.resize(graph_.size(), 0);

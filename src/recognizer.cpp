@@ -11,50 +11,48 @@
 
 #include "incremental_segmatch/stage_times.hpp"
 #include "incremental_segmatch/twist.hpp"
-#include "radix_sort.hpp"
 
 namespace incremental_segmatch {
 namespace {
 
 using Vertices = std::vector<std::uint32_t>;
 
-std::uint64_t Packed(const SegmentKey& key) {
-  return (std::uint64_t{key.robot} << 32) | key.id;
-}
-
-auto Values(const Correspondence& c) {
-  return std::make_tuple(c.centroid_local.x(), c.centroid_local.y(), c.centroid_local.z(), c.centroid_target.x(),
-                         c.centroid_target.y(), c.centroid_target.z(), c.descriptor_distance);
-}
-
-/// By the keys of local and target segment; by their values where somebody gives the same pair twice.
-Correspondences SortedCanonically(const Correspondences& correspondences) {
-  std::vector<std::uint64_t> local_keys, target_keys;
-  Vertices order(correspondences.size());
-  local_keys.reserve(order.size());
-  target_keys.reserve(order.size());
-  for (std::uint32_t i = 0; i < order.size(); ++i) {
-    order[i] = i;
-    local_keys.push_back(Packed(correspondences[i].local));
-    target_keys.push_back(Packed(correspondences[i].target));
-  }
-  order = SortedByKeys(std::move(order), local_keys, target_keys);
-  Correspondences sorted;
-  sorted.reserve(order.size());
-  for (const std::uint32_t i : order) sorted.push_back(correspondences[i]);
-
-  const auto same_pair = [](const Correspondence& a, const Correspondence& b) {
-    return a.local == b.local && a.target == b.target;
+/// The order of correspondences: by the keys of local and target segment; by their values where somebody gives the
+/// same pair twice.
+bool Precedes(const Correspondence& a, const Correspondence& b) {
+  const auto values = [](const Correspondence& c) {
+    return std::make_tuple(c.centroid_local.x(), c.centroid_local.y(), c.centroid_local.z(), c.centroid_target.x(),
+                           c.centroid_target.y(), c.centroid_target.z(), c.descriptor_distance);
   };
-  for (auto first = sorted.begin(); first != sorted.end();) {
-    auto last = first + 1;
-    while (last != sorted.end() && same_pair(*first, *last)) ++last;
-    if (last - first > 1) {
-      std::sort(first, last, [](const Correspondence& a, const Correspondence& b) { return Values(a) < Values(b); });
-    }
-    first = last;
+  const auto keys = [](const Correspondence& c) { return std::tie(c.local, c.target); };
+  return keys(a) < keys(b) || (keys(a) == keys(b) && values(a) < values(b));
+}
+
+/// The correspondences that are in some pairs, in their order, and the graph that the pairs make.
+struct Candidates {
+  Correspondences correspondences;
+  ConsistencyGraph graph;
+};
+
+Candidates CandidatesOf(const Correspondences& all, std::vector<ConsistencyGraph::Edge> pairs) {
+  Vertices vertex(all.size(), 0), index;  // of a correspondence in the graph and back
+  for (const auto& [a, b] : pairs) vertex[a] = vertex[b] = 1;
+  for (std::uint32_t i = 0; i < all.size(); ++i) {
+    if (vertex[i] == 1) index.push_back(i);
   }
-  return sorted;
+  std::sort(index.begin(), index.end(), [&](std::uint32_t a, std::uint32_t b) { return Precedes(all[a], all[b]); });
+  Candidates candidates;
+  candidates.correspondences.reserve(index.size());
+  for (const std::uint32_t i : index) {
+    vertex[i] = static_cast<std::uint32_t>(candidates.correspondences.size());
+    candidates.correspondences.push_back(all[i]);
+  }
+  for (auto& [a, b] : pairs) {
+    a = vertex[a];
+    b = vertex[b];
+  }
+  candidates.graph = ConsistencyGraph::FromEdges(index.size(), pairs);
+  return candidates;
 }
 
 /// Centroids of some correspondences, 3 x n, metres.
@@ -124,10 +122,21 @@ class SmallerResidual {
   double last_residual_ = 0.0;
 };
 
-/// The graph without some of its vertices, which keep their numbers but lose their edges.
-ConsistencyGraph Without(const ConsistencyGraph& graph, const Vertices& removed) {
-  std::vector<std::uint8_t> stays(graph.vertices(), 1);
-  for (const std::uint32_t v : removed) stays[v] = 0;
+/// Whether each correspondence is neither an inlier of a recognition nor fits its transform: a further sighting of an
+/// inlier's object is no rival of it.
+std::vector<std::uint8_t> RivalsOf(const Recognition& winner, const Correspondences& correspondences,
+                                   double same_place_m) {
+  std::vector<std::uint8_t> is_rival;
+  is_rival.reserve(correspondences.size());
+  for (const Correspondence& c : correspondences) {
+    is_rival.push_back((winner.T_target_local * c.centroid_local - c.centroid_target).norm() > same_place_m &&
+                       !std::binary_search(winner.inliers.begin(), winner.inliers.end(), c, Precedes));
+  }
+  return is_rival;
+}
+
+/// A graph without some of its vertices, which keep their numbers but lose their edges.
+ConsistencyGraph Among(const std::vector<std::uint8_t>& stays, const ConsistencyGraph& graph) {
   ConsistencyGraph rest;
   rest.offsets.reserve(graph.offsets.size());
   rest.neighbours.resize(graph.neighbours.size());
@@ -146,22 +155,13 @@ ConsistencyGraph Without(const ConsistencyGraph& graph, const Vertices& removed)
   return rest;
 }
 
-/// The correspondences that fit the transform: a further sighting of an inlier's object is no rival of it.
-Vertices Fitting(const Correspondences& correspondences, const Pose& T_target_local, double distance_m) {
-  Vertices fitting;
-  for (std::uint32_t v = 0; v < correspondences.size(); ++v) {
-    const Correspondence& c = correspondences[v];
-    if ((T_target_local * c.centroid_local - c.centroid_target).norm() <= distance_m) fitting.push_back(v);
-  }
-  return fitting;
-}
-
-/// The largest clique among the rest, if it is at least half as large as the winner.
-Vertices FindRunnerUp(const ConsistencyGraph& graph, std::size_t winner_size, const Vertices& fitting,
+/// The largest clique beside the winner, if it has so many vertices; empty without one.
+Vertices FindRunnerUp(const Candidates& candidates, const Recognition& winner, std::size_t size, double same_place_m,
                       MaxCliqueParameters parameters) {
-  parameters.min_size = std::max<std::size_t>(3, (winner_size + 1) / 2);
+  parameters.min_size = size;
   parameters.max_ties = 1;
-  return FindMaxClique(Without(graph, fitting), parameters).vertices;
+  const std::vector<std::uint8_t> is_rival = RivalsOf(winner, candidates.correspondences, same_place_m);
+  return FindMaxClique(Among(is_rival, candidates.graph), parameters).vertices;
 }
 
 void Validate(const RecognizerParameters& parameters) {
@@ -216,15 +216,17 @@ RecognizerResult Recognizer::Recognize(const Correspondences& correspondences) {
   result.candidates = correspondences.size();
 
   const double graph_start_ms = ThreadCpuMs();
-  const Correspondences sorted = SortedCanonically(correspondences);
-  const ConsistencyGraph graph = graph_builder_.Build(sorted);  // also of few ones: the cache follows them
-  result.edges = graph.edges;
-  result.tested_pairs = graph.tested_pairs;
+  // Also of few ones: the cache follows them.
+  ConsistentPairs found = graph_builder_.FindPairs(correspondences, parameters_.clique.min_size);
+  result.edges = found.pairs.size();
+  result.tested_pairs = found.tested_pairs;
+  Candidates candidates = CandidatesOf(correspondences, std::move(found.pairs));
   result.graph_ms = ThreadCpuMs() - graph_start_ms;
-  if (sorted.size() < parameters_.clique.min_size) return result;
+  if (correspondences.size() < parameters_.clique.min_size) return result;
 
   const double clique_start_ms = ThreadCpuMs();
-  const MaxCliqueResult clique = FindMaxClique(graph, parameters_.clique, SmallerResidual(sorted));
+  const MaxCliqueResult clique =
+      FindMaxClique(candidates.graph, parameters_.clique, SmallerResidual(candidates.correspondences));
   result.clique_size = clique.vertices.size();
   result.clique_ms = ThreadCpuMs() - clique_start_ms;
   result.outcome = RecognitionOutcome::kCliqueTooSmall;
@@ -232,7 +234,7 @@ RecognizerResult Recognizer::Recognize(const Correspondences& correspondences) {
 
   const double transform_start_ms = ThreadCpuMs();
   Recognition recognition;
-  result.outcome = FitAndTest(sorted, clique.vertices, &recognition);
+  result.outcome = FitAndTest(candidates.correspondences, clique.vertices, &recognition);
   recognition.proven_maximum = clique.proven_maximum;
   recognition.max_inliers = clique.upper_bound;
   result.transform_ms = ThreadCpuMs() - transform_start_ms;
@@ -240,12 +242,16 @@ RecognizerResult Recognizer::Recognize(const Correspondences& correspondences) {
 
   if (parameters_.find_runner_up) {
     const double runner_up_start_ms = ThreadCpuMs();
-    Vertices fitting = Fitting(sorted, recognition.T_target_local, parameters_.same_place_m);
-    fitting.insert(fitting.end(), clique.vertices.begin(), clique.vertices.end());
-    const Vertices runner_up = FindRunnerUp(graph, clique.vertices.size(), fitting, parameters_.clique);
+    const std::size_t size = std::max<std::size_t>(3, (clique.vertices.size() + 1) / 2);
+    // A smaller set may be among what was no candidate for the winner.
+    if (size < parameters_.clique.min_size)
+      candidates = CandidatesOf(correspondences, graph_builder_.FindPairs(correspondences, 2).pairs);
+    const Vertices runner_up =
+        FindRunnerUp(candidates, recognition, size, parameters_.same_place_m, parameters_.clique);
     recognition.runner_up_size = runner_up.size();
     Recognition other;
-    if (!runner_up.empty() && FitAndTest(sorted, runner_up, &other) == RecognitionOutcome::kAccepted) {
+    if (!runner_up.empty() &&
+        FitAndTest(candidates.correspondences, runner_up, &other) == RecognitionOutcome::kAccepted) {
       other.runner_up_size = clique.vertices.size();
       result.runner_up = std::move(other);
     }

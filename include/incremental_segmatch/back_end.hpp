@@ -128,7 +128,7 @@ struct BackEndCounts {
   std::size_t requeried = 0;           ///< local segments that were matched anew
   std::size_t candidates = 0;          ///< matches that entered recognition
   std::size_t tested_pairs = 0;        ///< of candidates, for consistency
-  std::size_t edges = 0;               ///< consistent pairs
+  std::size_t edges = 0;               ///< consistent pairs that may be in a set of the smallest acceptable size
   std::size_t clique = 0;              ///< size of the largest consistent set
   std::optional<Evidence> evidence;    ///< of a recognition that was judged, accepted or not
   StepEnd end = StepEnd::kNoSegments;  ///< the stage that ended the step

@@ -32,7 +32,6 @@ struct ConsistencyGraph {
 
   std::vector<std::size_t> offsets{0};    ///< vertices() + 1 entries
   std::vector<std::uint32_t> neighbours;  ///< 2 * edges entries
-  std::uint64_t tested_pairs = 0;         ///< how many pairs were tested for consistency
   std::size_t edges = 0;                  ///< number of edges, each counted once
 
   /// Number of vertices.
@@ -46,6 +45,12 @@ struct ConsistencyGraph {
 
   /// The graph with these edges, each given once, in any order and direction. O(vertices + edges).
   static ConsistencyGraph FromEdges(std::size_t vertices, const std::vector<Edge>& edges);
+};
+
+/// Which correspondences agree.
+struct ConsistentPairs {
+  std::vector<ConsistencyGraph::Edge> pairs;  ///< indices of correspondences, each pair once, in any order and direction
+  std::uint64_t tested_pairs = 0;             ///< how many pairs were tested for consistency
 };
 
 /// How the pairs to be tested are found. Every method returns the same edges.
@@ -106,7 +111,12 @@ class ConsistencyGraphBuilder {
   /// Moves likewise.
   ConsistencyGraphBuilder& operator=(ConsistencyGraphBuilder&&) noexcept;
 
-  /// Vertex i of the graph is correspondences[i]. A correspondence without usable coordinates has no edges.
+  /// The pairs that may be in a consistent set of `set_size` correspondences: those that are, together with any
+  /// correspondence of set_size - 2 others, three consistent pairs which are likewise (the truss of that order). All
+  /// consistent pairs for a set of two. A correspondence without usable coordinates is in none.
+  ConsistentPairs FindPairs(const Correspondences& correspondences, std::size_t set_size);
+
+  /// All consistent pairs as a graph, whose vertex i is correspondences[i].
   ConsistencyGraph Build(const Correspondences& correspondences);
 
  private:

@@ -48,7 +48,7 @@ struct RecognizerResult {
   std::optional<Recognition> runner_up;  ///< the other place that its runner-up speaks for, if that passes the same tests
   RecognitionOutcome outcome = RecognitionOutcome::kTooFewCandidates;  ///< how it ended
   std::size_t candidates = 0;                                          ///< correspondences given
-  std::size_t edges = 0;                                               ///< consistent pairs
+  std::size_t edges = 0;        ///< consistent pairs among those that may be in a set of the smallest acceptable size
   std::uint64_t tested_pairs = 0;                                      ///< pairs tested for consistency
   std::size_t clique_size = 0;  ///< of the best clique found, 0 below the smallest acceptable size
   double graph_ms = 0.0;        ///< time for the consistency graph (these three: CPU time of the thread)

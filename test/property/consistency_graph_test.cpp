@@ -1,4 +1,4 @@
-// Contract 5: partitioned == cached == all pairs, edge for edge.
+// Contract 5: partitioned == cached == all pairs, edge for edge, and so are the pairs that sets of some size may hold.
 #include "incremental_segmatch/consistency_graph.hpp"
 
 #include <gtest/gtest.h>
@@ -10,6 +10,7 @@
 #include <random>
 #include <set>
 #include <string>
+#include <tuple>
 
 namespace incremental_segmatch {
 namespace {
@@ -214,6 +215,93 @@ TEST(ConsistencyGraph, EveryMethodGivesTheEdgesOfTheDefinition) {
   EXPECT_GT(edges_seen, 100000u) << "the sequences are too thin to say anything";
 }
 
+/// The definition of a truss, as directly as it can be written: edges go until each is in k - 2 triangles.
+EdgeSet ExpectedTruss(EdgeSet edges, std::size_t k) {
+  for (;;) {
+    std::map<std::uint32_t, std::set<std::uint32_t>> neighbours;
+    for (const auto& [a, b] : edges) {
+      neighbours[a].insert(b);
+      neighbours[b].insert(a);
+    }
+    const auto in_too_few = [&](const ConsistencyGraph::Edge& edge) {
+      std::size_t triangles = 0;
+      for (const std::uint32_t v : neighbours[edge.first]) triangles += neighbours[edge.second].count(v);
+      return triangles + 2 < k;
+    };
+    const auto last = std::remove_if(edges.begin(), edges.end(), in_too_few);
+    if (last == edges.end()) return edges;
+    edges.erase(last, edges.end());
+  }
+}
+
+EdgeSet Sorted(EdgeSet edges) {
+  for (auto& [a, b] : edges) std::tie(a, b) = std::make_pair(std::min(a, b), std::max(a, b));
+  std::sort(edges.begin(), edges.end());
+  return edges;
+}
+
+TEST(ConsistencyGraph, EveryMethodFindsThePairsThatSetsMayHold) {
+  std::size_t kept = 0, dropped = 0;
+  for (unsigned seed = 2000; seed < 2150; ++seed) {
+    SCOPED_TRACE("seed " + std::to_string(seed));
+    RandomSequence sequence(seed);
+    std::map<std::string, ConsistencyGraphBuilder> builders;
+    for (const auto& [name, method] : Methods()) {
+      ConsistencyParameters parameters = sequence.parameters();
+      parameters.method = method;
+      builders.emplace(name, parameters);
+    }
+    for (int step = 0; step < 4; ++step) {
+      const Correspondences correspondences = sequence.Current();
+      const EdgeSet edges = ExpectedEdges(correspondences, sequence.parameters());
+      for (std::size_t set_size = 2; set_size <= 8; set_size += step + 1) {
+        SCOPED_TRACE("step " + std::to_string(step) + ", set size " + std::to_string(set_size));
+        const EdgeSet expected = ExpectedTruss(edges, set_size);
+        for (auto& [name, builder] : builders)
+          ASSERT_EQ(Sorted(builder.FindPairs(correspondences, set_size).pairs), expected) << name;
+        if (set_size == 2) continue;
+        kept += expected.size();
+        dropped += edges.size() - expected.size();
+      }
+      sequence.Step();
+    }
+  }
+  EXPECT_GT(kept, 10000u) << "the sequences are too thin to say anything";
+  EXPECT_GT(dropped, 10000u) << "the sequences are too dense to say anything";
+}
+
+/// More correspondences than a sketch has bits, most of them false: some places seen again among many others.
+TEST(ConsistencyGraph, FindsThePairsThatSetsMayHoldAmongThousands) {
+  for (unsigned seed = 0; seed < 10; ++seed) {
+    SCOPED_TRACE("seed " + std::to_string(seed));
+    std::mt19937 random(seed);
+    std::uniform_real_distribution<double> unit(-1.0, 1.0);
+    const auto point = [&](double radius_m) {
+      return Eigen::Vector3d(radius_m * unit(random), radius_m * unit(random), unit(random));
+    };
+    Correspondences correspondences;
+    const Eigen::Vector3d places[] = {point(150.0), point(150.0), point(150.0)};
+    for (SegmentId local = 1; local <= 80; ++local) {
+      const Eigen::Vector3d p = point(40.0);
+      for (SegmentId k = 0; k < 20; ++k) correspondences.push_back(Make(local, 100 * local + k, p, point(150.0)));
+      for (SegmentId k = 0; k < 3; ++k) {
+        if (local % (7 + 3 * k) == 0)
+          correspondences.push_back(Make(local, 100 * local + 20 + k, p, p + places[k] + 0.1 * point(1.0)));
+      }
+    }
+    std::shuffle(correspondences.begin(), correspondences.end(), random);
+    const EdgeSet edges = ExpectedEdges(correspondences, With(ConsistencyMethod::kPartitioned2D));
+    for (std::size_t set_size = 3; set_size <= 9; ++set_size) {
+      const EdgeSet expected = ExpectedTruss(edges, set_size);
+      for (const auto& [name, method] : Methods())
+        ASSERT_EQ(Sorted(ConsistencyGraphBuilder(With(method)).FindPairs(correspondences, set_size).pairs), expected)
+            << name << ", set size " << set_size;
+      EXPECT_LT(expected.size(), edges.size());
+      EXPECT_GT(expected.size(), 10u);
+    }
+  }
+}
+
 TEST(ConsistencyGraph, PredicateIsTheDefinition) {
   for (unsigned seed = 1000; seed < 2000; ++seed) {
     SCOPED_TRACE("seed " + std::to_string(seed));
@@ -288,8 +376,8 @@ TEST(ConsistencyGraph, CacheTestsLittleWhereLittleMoves) {
   parameters.method = ConsistencyMethod::kCached;
   ConsistencyGraphBuilder builder(parameters);
   const Correspondences correspondences = sequence.Current();
-  const std::uint64_t first = builder.Build(correspondences).tested_pairs;
-  EXPECT_LT(builder.Build(correspondences).tested_pairs, first / 100 + 1);
+  const std::uint64_t first = builder.FindPairs(correspondences, 2).tested_pairs;
+  EXPECT_LT(builder.FindPairs(correspondences, 2).tested_pairs, first / 100 + 1);
 }
 
 TEST(ConsistencyGraph, PairsThatShareASegmentAreNeverConsistent) {
@@ -349,9 +437,11 @@ TEST(ConsistencyGraph, PartitionsTestFewPairsInALargeMap) {
     correspondences.push_back(Make(1 + i % 50, 100 + i, locals[i % 50], {target(random), target(random), 0.0}));
   }
   const std::uint64_t all = 2000u * 1999u / 2u;
-  EXPECT_EQ(ConsistencyGraphBuilder(With(ConsistencyMethod::kAllPairs)).Build(correspondences).tested_pairs, all);
-  const auto tested =
-      ConsistencyGraphBuilder(With(ConsistencyMethod::kPartitioned2D)).Build(correspondences).tested_pairs;
+  const auto tested_by = [&](ConsistencyMethod method) {
+    return ConsistencyGraphBuilder(With(method)).FindPairs(correspondences, 2).tested_pairs;
+  };
+  EXPECT_EQ(tested_by(ConsistencyMethod::kAllPairs), all);
+  const auto tested = tested_by(ConsistencyMethod::kPartitioned2D);
   EXPECT_LT(tested, all / 50);
   EXPECT_GT(tested, 0u);
 }

@@ -5,6 +5,7 @@
 #include <gtest/gtest.h>
 
 #include <algorithm>
+#include <chrono>
 #include <cmath>
 #include <random>
 
@@ -230,6 +231,49 @@ TEST(Recognizer, EveryMethodGivesTheSameRecognition) {
       for (int call = 0; call < 6; ++call) ExpectEqual(expected, recognizer.Recognize(scene.correspondences));
     }
   }
+}
+
+// The oracle searches all consistent pairs, where the recognizer looks at those only that enough others support.
+TEST(Recognizer, SizesAreThoseOfTheWholeGraph) {
+  std::size_t small_winners = 0, rivals = 0;
+  for (unsigned seed = 0; seed < 1000; ++seed) {
+    SCOPED_TRACE("seed " + std::to_string(seed));
+    Random random(seed);
+    Scene scene = RandomScene(random, 5 + random.Below(8), 150, 0.05, 0.0);
+    const double again = random.Unit();  // of the true objects these stand elsewhere once more, in the same way
+    for (Correspondence c : Correspondences(scene.correspondences)) {
+      if (c.target.id >= 1000 || random.Unit() > again) continue;
+      c.target.id += 500;
+      c.centroid_target += Eigen::Vector3d(90.0, 40.0, 0.0);
+      scene.correspondences.push_back(c);
+    }
+    RecognizerParameters parameters;
+    parameters.clique.max_work = parameters.clique.max_tie_work = std::uint64_t{1} << 60;
+    parameters.clique.deadline = std::chrono::seconds(1000);
+    const RecognizerResult result = Recognizer(parameters).Recognize(scene.correspondences);
+    const auto largest = [&](const Correspondences& c, std::size_t min_size) {
+      MaxCliqueParameters clique = parameters.clique;
+      clique.min_size = min_size;
+      return FindMaxClique(ConsistencyGraphBuilder(parameters.consistency).Build(c), clique).vertices.size();
+    };
+    EXPECT_EQ(result.clique_size, largest(scene.correspondences, parameters.clique.min_size));
+    if (!result.recognition) continue;
+    const Recognition& winner = *result.recognition;
+    Correspondences others;
+    for (const Correspondence& c : scene.correspondences) {
+      const bool fits = (winner.T_target_local * c.centroid_local - c.centroid_target).norm() <= parameters.same_place_m;
+      const bool is_inlier = std::any_of(winner.inliers.begin(), winner.inliers.end(), [&](const Correspondence& i) {
+        return i.local == c.local && i.target == c.target;
+      });
+      if (!fits && !is_inlier) others.push_back(c);
+    }
+    const std::size_t least = std::max<std::size_t>(3, (winner.inliers.size() + 1) / 2);
+    EXPECT_EQ(winner.runner_up_size, largest(others, least));
+    small_winners += least < parameters.clique.min_size && winner.runner_up_size > 0 ? 1 : 0;
+    rivals += least >= parameters.clique.min_size && winner.runner_up_size > 0 ? 1 : 0;
+  }
+  EXPECT_GT(small_winners, 50u);
+  EXPECT_GT(rivals, 10u);
 }
 
 // A street seen in a mirror: all distances agree, and with centroids near a plane a roll of 180 degrees fits well.
