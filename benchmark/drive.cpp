@@ -33,8 +33,17 @@ const std::vector<DriveScan>& Drive() {
 
 const std::vector<DriveSetup>& Setups() {
   static const std::vector<DriveSetup> setups{
-      {"1e4", 12.0, 12.0, 50, 100, 5}, {"2e5", 50.0, 50.0, 150, 100, 10}, {"1e6", 50.0, 1e6, kScans - 100, 100, 20}};
+      {"1e4", 12.0, 12.0, 50, 100, 5},
+      {"2e5", 50.0, 50.0, 150, 100, 10},
+      {"1e6", 50.0, 1000.0, kScans - 100, 100, 20}};
   return setups;
+}
+
+DriveSetup GrowingSetup() {
+  DriveSetup setup = Setups().back();
+  setup.name += "_growing";
+  setup.grows = true;
+  return setup;
 }
 
 std::vector<DriveScan> Scans(const DriveSetup& setup) {

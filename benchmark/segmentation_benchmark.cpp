@@ -159,6 +159,8 @@ void Run(benchmark::State& state, const DriveSetup& setup) {
 }
 
 void Register() {
+  const DriveSetup growing = GrowingSetup();
+  RegisterStage("euclidean", "incremental", growing, growing.measured_scans, Run<EuclideanMap>);
   for (const DriveSetup& setup : Setups()) {
     RegisterStage("euclidean", "incremental", setup, setup.measured_scans, Run<EuclideanMap>);
     RegisterStage("euclidean", "rebuilt_tree", setup, setup.measured_scans, Run<RebuiltTreeMap>);

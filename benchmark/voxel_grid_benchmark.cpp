@@ -46,12 +46,17 @@ struct BatchMap {
   void Count(benchmark::State& state) const { state.counters["voxels"] = static_cast<double>(batch.size()); }
 };
 
+void RegisterIncremental(const DriveSetup& setup) {
+  RegisterStage("voxel_grid", "incremental", setup, setup.measured_scans, [](benchmark::State& state, const DriveSetup& s) {
+    IncrementalMap map{DynamicVoxelGrid(DynamicVoxelGridParameters{}), s.local_radius_m};
+    MeasureSteps(state, s, map);
+  });
+}
+
 void Register() {
+  RegisterIncremental(GrowingSetup());
   for (const DriveSetup& setup : Setups()) {
-    RegisterStage("voxel_grid", "incremental", setup, setup.measured_scans, [](benchmark::State& state, const DriveSetup& s) {
-      IncrementalMap map{DynamicVoxelGrid(DynamicVoxelGridParameters{}), s.local_radius_m};
-      MeasureSteps(state, s, map);
-    });
+    RegisterIncremental(setup);
     RegisterStage("voxel_grid", "sorted_vector", setup, setup.measured_scans, [](benchmark::State& state, const DriveSetup& s) {
       SortedMap map{SortedVectorGrid(DynamicVoxelGridParameters{}.resolution_m), s.local_radius_m};
       MeasureSteps(state, s, map);
