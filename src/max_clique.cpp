@@ -411,7 +411,7 @@ Vertices Finder::Named(const Vertices& clique) const {
 }
 
 /// An incumbent, if one of the cliques around the vertices of the highest degrees is larger than the last: grown by the
-/// candidate of the highest degree, again and again.
+/// candidate of the highest degree, again and again, from vertices that are in none yet.
 void Finder::GrowGreedily() {
   constexpr std::size_t kStarts = 16;
   const ConsistencyGraph& graph = *remaining_;
@@ -428,6 +428,7 @@ void Finder::GrowGreedily() {
   Vertices candidates, common;
   for (const std::uint32_t start : starts) {
     if (degree[start] < floor_ || effort_.IsExhausted()) return;
+    if (std::binary_search(best_.begin(), best_.end(), names_[start])) continue;  // it would grow into the same one
     candidates.assign(graph.Neighbours(start).begin(), graph.Neighbours(start).end());
     Vertices clique{start};
     while (!candidates.empty() && clique.size() + candidates.size() > floor_) {
