@@ -99,7 +99,8 @@ struct ScreenArrays {
   struct alignas(64) Block {
     float coordinates[6][kBlock];
   };
-  std::vector<Block> blocks;  ///< the last one padded
+  static constexpr std::uint32_t kBlocksAtATime = 4;
+  std::vector<Block> blocks;  ///< the last one padded, and more behind it: what is read together may begin with any
   float factor = 0.f;         ///< 2 tol^2
 };
 
@@ -121,7 +122,7 @@ void FillScreenArrays(const std::vector<Match>& matches, const Bounds& local, co
   constexpr double kFloatRounding = 1.0 / (1 << 24);
   constexpr double kDoubleRounding = 1e-15;
   constexpr std::uint32_t kBlock = ScreenArrays::kBlock;
-  arrays.blocks.resize((matches.size() + kBlock - 1) / kBlock);
+  arrays.blocks.resize((matches.size() + kBlock - 1) / kBlock + ScreenArrays::kBlocksAtATime - 1);
   if (matches.empty()) return;
 
   const double extent = std::max(local.half_extent(), target.half_extent());
@@ -259,26 +260,22 @@ SEGMATCH_AVX512 inline std::uint64_t ScreenBlock(const Own512& own, const Screen
                             _CMP_LE_OQ);
 }
 
-/// The same as ScreenPortable, four blocks at a time, and the rest of a range one at a time. Becomes a part of its callers,
-/// which say for what processor it is compiled.
+/// The same as ScreenPortable, four blocks at a time. Becomes a part of its callers, which say for what processor it is
+/// compiled.
 template <class Own>
 __attribute__((always_inline)) inline std::size_t ScreenRanges(const Own& own, const ScreenArrays& arrays,
                                                                const std::vector<Range>& ranges, std::uint32_t* hits) {
-  constexpr std::uint32_t kBlock = ScreenArrays::kBlock;
+  constexpr std::uint32_t kBlock = ScreenArrays::kBlock, kAtATime = ScreenArrays::kBlocksAtATime * kBlock;
   std::size_t count = 0;
   for (const Range range : ranges) {
     std::uint32_t j = range.begin / kBlock * kBlock;
     std::uint64_t valid = ~std::uint64_t{0} << (range.begin - j);
-    for (; j + 4 * kBlock <= range.end; j += 4 * kBlock) {
+    for (; j < range.end; j += kAtATime) {
       const ScreenArrays::Block* const block = &arrays.blocks[j / kBlock];
       const std::uint64_t mask = ScreenBlock(own, block[0]) | ScreenBlock(own, block[1]) << kBlock |
                                  ScreenBlock(own, block[2]) << 2 * kBlock | ScreenBlock(own, block[3]) << 3 * kBlock;
+      if (range.end - j < kAtATime) valid &= (std::uint64_t{1} << (range.end - j)) - 1;
       count = AppendBits(mask & valid, j, hits, count);
-      valid = ~std::uint64_t{0};
-    }
-    for (; j < range.end; j += kBlock) {
-      if (range.end - j < kBlock) valid &= (std::uint64_t{1} << (range.end - j)) - 1;
-      count = AppendBits(ScreenBlock(own, arrays.blocks[j / kBlock]) & valid, j, hits, count);
       valid = ~std::uint64_t{0};
     }
   }
