@@ -142,8 +142,8 @@ void RecognizeOurs(benchmark::State& state, ConsistencyMethod method) {
 }
 
 /// How the time grows with the number of correspondences alone: in maps without a border, and of the same hundred
-/// thousand correspondences in all, for a small input that is given again and again stays in the cache, and the processor
-/// learns its branches.
+/// thousand correspondences in all, for a small input that is given again and again stays in the cache, and the
+/// processor learns its branches.
 void RecognizeInDistricts(benchmark::State& state, ConsistencyMethod method) {
   constexpr std::size_t kPerDistrict = 1000;
   constexpr std::size_t kInAll = 100000;

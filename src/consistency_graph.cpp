@@ -330,13 +330,13 @@ class Partition {
   /// Index of the match in the list that was assigned.
   std::uint32_t index(std::uint32_t slot) const { return order_[slot]; }
 
-  /// Calls visit(slot, begin, end) for each slot, with those later ones that pass the screen: every unordered pair once.
-  /// Returns the number of pairs screened.
+  /// Calls visit(slot, begin, end) for each slot, with those later ones that pass the screen: every unordered pair
+  /// once. Returns the number of pairs screened.
   template <typename Visit>
   std::uint64_t ForEachLater(Visit visit);
 
-  /// Calls visit(slot, begin, end) for those slots for which selected(slot), with all that pass the screen, the slot itself
-  /// among them. Returns the number of pairs screened.
+  /// Calls visit(slot, begin, end) for those slots for which selected(slot), with all that pass the screen, the slot
+  /// itself among them. Returns the number of pairs screened.
   template <typename Selected, typename Visit>
   std::uint64_t ForEachOf(Selected selected, Visit visit);
 
@@ -882,8 +882,8 @@ class ConsistencyGraphBuilder::Impl {
                        ConsistentPairs& found);
 
   ConsistencyParameters parameters_;
-  std::vector<Match> matches_;          ///< of the last call, as what follows: memory that the next one reuses
-  std::vector<std::uint32_t> indices_;  ///< of the matches among the correspondences
+  std::vector<Match> matches_;                 ///< of the last call, as what follows: memory that the next one reuses
+  std::vector<std::uint32_t> indices_;         ///< of the matches among the correspondences
   std::vector<ConsistencyGraph::Edge> slots_;  ///< of the partition, that may be a pair
   Partition partition_;
   Cache cache_;
@@ -891,8 +891,8 @@ class ConsistencyGraphBuilder::Impl {
   MethodChooser chooser_;
 };
 
-/// By slot, what is near each other in the target map is near each other in memory. The predicate decides late, on the few
-/// pairs that enough others support even if all that pass the screen were consistent.
+/// By slot, what is near each other in the target map is near each other in memory. The predicate decides late, on the
+/// few pairs that enough others support even if all that pass the screen were consistent.
 void ConsistencyGraphBuilder::Impl::FindPartitioned(const Correspondences& correspondences, std::size_t set_size,
                                                     Layout layout, ConsistentPairs& found) {
   matches_.clear();

@@ -16,7 +16,6 @@ namespace {
 
 using Word = std::uint64_t;
 using Vertices = std::vector<std::uint32_t>;
-using Edges = std::vector<ConsistencyGraph::Edge>;
 using Clock = std::chrono::steady_clock;
 
 constexpr std::size_t kWordBits = 64;
@@ -245,12 +244,6 @@ void Search::Expand(Word* candidates) {
   }
 }
 
-/// A subgraph; its vertices are renumbered in their order.
-struct NamedGraph {
-  ConsistencyGraph graph;
-  Vertices names;  ///< of the vertices: their numbers in the whole graph
-};
-
 /// The subgraph of the vertices for which keep(v), and their numbers in the whole graph.
 template <typename Keep>
 NamedGraph Subgraph(const ConsistencyGraph& graph, Keep keep) {
@@ -281,8 +274,9 @@ NamedGraph Subgraph(const ConsistencyGraph& graph, Keep keep) {
 }
 
 /// Without edges that are in no clique of `size` vertices; nothing where none is known to be.
-std::optional<NamedGraph> WithoutUnsupportedEdges(const ConsistencyGraph& graph, std::size_t size, TrussFinder* finder) {
-  TrussFinder::Edges edges;
+std::optional<NamedGraph> WithoutUnsupportedEdges(const ConsistencyGraph& graph, std::size_t size,
+                                                  TrussFinder* finder) {
+  Edges edges;
   edges.reserve(graph.edges);
   for (std::uint32_t v = 0; v < graph.vertices(); ++v) {
     for (const std::uint32_t u : graph.Neighbours(v))
@@ -290,21 +284,7 @@ std::optional<NamedGraph> WithoutUnsupportedEdges(const ConsistencyGraph& graph,
   }
   finder->DropByBound(graph.vertices(), size, &edges);
   if (edges.size() == graph.edges) return std::nullopt;
-
-  NamedGraph kept;
-  Vertices new_index(graph.vertices(), 0);
-  for (const auto& [a, b] : edges) new_index[a] = new_index[b] = 1;
-  for (std::uint32_t v = 0; v < graph.vertices(); ++v) {
-    if (new_index[v] == 0) continue;
-    new_index[v] = static_cast<std::uint32_t>(kept.names.size());
-    kept.names.push_back(v);
-  }
-  for (auto& [a, b] : edges) {
-    a = new_index[a];
-    b = new_index[b];
-  }
-  kept.graph = ConsistencyGraph::FromEdges(kept.names.size(), edges);
-  return kept;
+  return WithoutLoneVertices(graph.vertices(), std::move(edges));
 }
 
 /// The vertices of a graph that are in a core of some order, renumbered in degeneracy order.

@@ -21,6 +21,23 @@ std::size_t CountBits(std::uint64_t word) {
 
 }  // namespace
 
+NamedGraph WithoutLoneVertices(std::size_t vertices, Edges edges) {
+  std::vector<std::uint32_t> number(vertices, 0);
+  for (const auto& [a, b] : edges) number[a] = number[b] = 1;
+  NamedGraph kept;
+  for (std::uint32_t v = 0; v < vertices; ++v) {
+    if (number[v] == 0) continue;
+    number[v] = static_cast<std::uint32_t>(kept.names.size());
+    kept.names.push_back(v);
+  }
+  for (auto& [a, b] : edges) {
+    a = number[a];
+    b = number[b];
+  }
+  kept.graph = ConsistencyGraph::FromEdges(kept.names.size(), edges);
+  return kept;
+}
+
 void TrussFinder::DropByBound(std::size_t vertices, std::size_t k, Edges* edges) {
   if (k < 3) return;
   for (bool pays = true; pays;) {
@@ -69,25 +86,14 @@ void TrussFinder::DropOnce(std::size_t common, Edges* edges) {
 void TrussFinder::DropByCount(std::size_t vertices, std::size_t k, Edges* edges) {
   if (k < 3) return;
   const std::size_t common = k - 2;
-  number_.assign(vertices, 0);
-  name_.clear();
-  for (const auto& [a, b] : *edges) number_[a] = number_[b] = 1;
-  for (std::uint32_t v = 0; v < number_.size(); ++v) {
-    if (number_[v] == 0) continue;
-    name_.push_back(v);
-    number_[v] = static_cast<std::uint32_t>(name_.size());
-  }
-  for (auto& [a, b] : *edges) {
-    a = number_[a] - 1;
-    b = number_[b] - 1;
-  }
-  graph_ = ConsistencyGraph::FromEdges(name_.size(), *edges);
+  NamedGraph named = WithoutLoneVertices(vertices, *edges);
+  graph_ = std::move(named.graph);
   row_end_.assign(graph_.offsets.begin() + 1, graph_.offsets.end());
-  is_marked_.assign(name_.size(), 0);
-  is_changed_.assign(name_.size(), 0);
+  is_marked_.assign(named.names.size(), 0);
+  is_changed_.assign(named.names.size(), 0);
   changed_.clear();
 
-  for (std::uint32_t v = 0; v < name_.size(); ++v) Examine(v, common, true);
+  for (std::uint32_t v = 0; v < named.names.size(); ++v) Examine(v, common, true);
   while (!changed_.empty()) {
     waiting_.swap(changed_);
     changed_.clear();
@@ -98,10 +104,10 @@ void TrussFinder::DropByCount(std::size_t vertices, std::size_t k, Edges* edges)
   }
 
   edges->clear();
-  for (std::uint32_t v = 0; v < name_.size(); ++v) {
+  for (std::uint32_t v = 0; v < named.names.size(); ++v) {
     for (std::size_t k = graph_.offsets[v]; k < row_end_[v]; ++k) {
       const std::uint32_t u = graph_.neighbours[k];
-      if (v < u) edges->emplace_back(name_[v], name_[u]);
+      if (v < u) edges->emplace_back(named.names[v], named.names[u]);
     }
   }
 }

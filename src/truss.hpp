@@ -11,19 +11,29 @@
 
 namespace incremental_segmatch {
 
-/// Reduces a graph towards its k-truss (Cohen), the largest subgraph each of whose edges is in k - 2 triangles of it: every
-/// clique of k vertices is in that. The graph's vertices are 0..vertices-1, its edges are given once each. Keeps its memory from
-/// one graph to the next.
+using Edges = std::vector<ConsistencyGraph::Edge>;
+
+/// A part of a graph; its vertices are renumbered in their order.
+struct NamedGraph {
+  ConsistencyGraph graph;
+  std::vector<std::uint32_t> names;  ///< of the vertices: their numbers in the whole graph
+};
+
+/// The vertices that have edges, of vertices 0..vertices-1. O(vertices + edges).
+NamedGraph WithoutLoneVertices(std::size_t vertices, Edges edges);
+
+/// Reduces a graph towards its k-truss (Cohen), the largest subgraph each of whose edges is in k - 2 triangles of it:
+/// every clique of k vertices is in that. The graph's vertices are 0..vertices-1, its edges are given once each. Keeps
+/// its memory from one graph to the next.
 class TrussFinder {
  public:
-  using Edges = std::vector<ConsistencyGraph::Edge>;
   static constexpr std::size_t kSketchWords = 8;  ///< a cache line
 
   /// Drops edges for which bits alone tell that they are not in the k-truss, in sparse graphs nearly all of these.
   /// O(vertices + edges).
   void DropByBound(std::size_t vertices, std::size_t k, Edges* edges);
-  /// Drops all edges that are not in the k-truss. O(vertices + edges), and for each edge up to the neighbours of an end, again
-  /// whenever an end has lost some.
+  /// Drops all edges that are not in the k-truss. O(vertices + edges), and for each edge up to the neighbours of an
+  /// end, again whenever an end has lost some.
   void DropByCount(std::size_t vertices, std::size_t k, Edges* edges);
 
  private:
@@ -42,9 +52,7 @@ class TrussFinder {
   Vertices degree_;
   std::vector<Sketch> sketches_;
   Vertices hidden_;  ///< neighbours of each vertex whose bit another one had set
-  // What is left after that, by new numbers.
-  Vertices number_;         ///< by vertex, one more than the new one; 0: none
-  Vertices name_;           ///< by new number
+  // While edges are counted, by new numbers:
   ConsistencyGraph graph_;  ///< its rows lose neighbours, and are as long as row_end_ says
   std::vector<std::size_t> row_end_;
   std::vector<std::uint8_t> is_marked_;  ///< neighbours of the vertex that is examined

@@ -49,8 +49,9 @@ struct ConsistencyGraph {
 
 /// Which correspondences agree.
 struct ConsistentPairs {
-  std::vector<ConsistencyGraph::Edge> pairs;  ///< indices of correspondences, each pair once, in any order and direction
-  std::uint64_t tested_pairs = 0;             ///< how many pairs were tested for consistency
+  std::vector<ConsistencyGraph::Edge>
+      pairs;                       ///< indices of correspondences, each pair once, in any order and direction
+  std::uint64_t tested_pairs = 0;  ///< how many pairs were tested for consistency
 };
 
 /// How the pairs to be tested are found. Every method returns the same edges.

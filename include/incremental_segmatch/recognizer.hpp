@@ -37,23 +37,24 @@ struct Recognition {
   bool proven_maximum = true;           ///< false if the search for a larger clique was cut short
   std::size_t max_inliers = 0;          ///< no clique is larger than this; inliers.size() if proven
   /// Size of the largest clique that shares no correspondence with the inliers, nor has any that fits their transform:
-  /// near inliers.size() means that another place is as likely. 0 if it is smaller than 3 or than half of the inliers, or not looked for. A lower bound if
-  /// the search for it was as long as that for the inliers may be.
+  /// near inliers.size() means that another place is as likely. 0 if it is smaller than 3 or than half of the inliers,
+  /// or not looked for. A lower bound if the search for it was as long as that for the inliers may be.
   std::size_t runner_up_size = 0;
 };
 
 /// A recognition, or the stage that ended it, with counts and times.
 struct RecognizerResult {
-  std::optional<Recognition> recognition;                              ///< where the outcome is kAccepted
-  std::optional<Recognition> runner_up;  ///< the other place that its runner-up speaks for, if that passes the same tests
+  std::optional<Recognition> recognition;  ///< where the outcome is kAccepted
+  std::optional<Recognition>
+      runner_up;  ///< the other place that its runner-up speaks for, if that passes the same tests
   RecognitionOutcome outcome = RecognitionOutcome::kTooFewCandidates;  ///< how it ended
   std::size_t candidates = 0;                                          ///< correspondences given
-  std::size_t edges = 0;        ///< consistent pairs among those that may be in a set of the smallest acceptable size
-  std::uint64_t tested_pairs = 0;                                      ///< pairs tested for consistency
-  std::size_t clique_size = 0;  ///< of the best clique found, 0 below the smallest acceptable size
-  double graph_ms = 0.0;        ///< time for the consistency graph (these three: CPU time of the thread)
-  double clique_ms = 0.0;       ///< including the search for the runner-up
-  double transform_ms = 0.0;    ///< time for the transform and its tests
+  std::size_t edges = 0;  ///< consistent pairs among those that may be in a set of the smallest acceptable size
+  std::uint64_t tested_pairs = 0;  ///< pairs tested for consistency
+  std::size_t clique_size = 0;     ///< of the best clique found, 0 below the smallest acceptable size
+  double graph_ms = 0.0;           ///< time for the consistency graph (these three: CPU time of the thread)
+  double clique_ms = 0.0;          ///< including the search for the runner-up
+  double transform_ms = 0.0;       ///< time for the transform and its tests
 };
 
 /// Covariance of the least-squares transform of points to `points_target` (the transformed points, target frame) with
@@ -63,8 +64,8 @@ struct RecognizerResult {
 /// times the lever arm. The points must not be collinear.
 Covariance6 TransformCovariance(const std::vector<Eigen::Vector3d>& points_target, double sigma_m);
 
-/// Standard deviation per axis of a centroid's error, from the residual of a rigid fit, which took six degrees of freedom;
-/// at least min_sigma_m.
+/// Standard deviation per axis of a centroid's error, from the residual of a rigid fit, which took six degrees of
+/// freedom; at least min_sigma_m.
 double CentroidSigma(double rms_m, std::size_t inliers, double min_sigma_m);
 
 /// Maximum geometrically consistent set of the correspondences and its rigid transform. No prior on the pose enters.

@@ -261,7 +261,8 @@ TEST(Recognizer, SizesAreThoseOfTheWholeGraph) {
     const Recognition& winner = *result.recognition;
     Correspondences others;
     for (const Correspondence& c : scene.correspondences) {
-      const bool fits = (winner.T_target_local * c.centroid_local - c.centroid_target).norm() <= parameters.same_place_m;
+      const bool fits =
+          (winner.T_target_local * c.centroid_local - c.centroid_target).norm() <= parameters.same_place_m;
       const bool is_inlier = std::any_of(winner.inliers.begin(), winner.inliers.end(), [&](const Correspondence& i) {
         return i.local == c.local && i.target == c.target;
       });
