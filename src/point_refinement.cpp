@@ -45,6 +45,10 @@ Matrix6 Shift(const Eigen::Vector3d& center) {
 class CellHash {
  public:
   CellHash(const std::vector<Eigen::Vector3f>& points, float side) : side_(side), per_metre_(1.f / side) {
+    std::vector<std::uint64_t> keys;
+    keys.reserve(points.size() + kAhead);
+    for (const Eigen::Vector3f& point : points) keys.push_back(KeyOf(point));
+    keys.resize(points.size() + kAhead, 0);
     std::vector<std::uint32_t> slot_of(points.size());
     const auto count_points = [&](std::size_t least_slots) {
       std::size_t slots = 16;
@@ -52,7 +56,8 @@ class CellHash {
       table_.assign(slots, {});
       used_.clear();
       for (std::size_t i = 0; i < points.size(); ++i) {
-        slot_of[i] = FindOrAdd(KeyOf(points[i]));
+        Fetch(&table_[SlotOf(keys[i + kAhead])]);
+        slot_of[i] = FindOrAdd(keys[i]);
         ++table_[slot_of[i]].count;
       }
     };
@@ -67,6 +72,7 @@ class CellHash {
     }
     points_.resize(points.size());
     for (std::size_t i = 0; i < points.size(); ++i) {
+      Fetch(&table_[slot_of[std::min(i + kAhead, points.size() - 1)]]);
       Cell& cell = table_[slot_of[i]];
       points_[cell.begin + cell.count++] = points[i];
     }
@@ -125,6 +131,15 @@ class CellHash {
     std::uint32_t count = 0;  ///< 0: a free slot
   };
   static constexpr std::uint64_t kBias = std::uint64_t{1} << 20;
+  static constexpr std::size_t kAhead = 16;  ///< points whose cells are fetched before they are read
+
+  static void Fetch(const Cell* cell) {
+#if defined(__GNUC__)
+    __builtin_prefetch(cell);
+#else
+    (void)cell;
+#endif
+  }
 
   static std::uint64_t Pack(std::int64_t x, std::int64_t y, std::int64_t z) {
     return (static_cast<std::uint64_t>(x) + kBias) << 42 | ((static_cast<std::uint64_t>(y) + kBias) & 0x1fffff) << 21 |
