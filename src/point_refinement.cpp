@@ -102,8 +102,10 @@ class CellHash {
   std::uint32_t Nearest(const Eigen::Vector3f& p, float distance) const {
     std::uint32_t nearest = kNone;
     float best = distance * distance;
-    VisitCells(p, &best, [&](const Cell& cell) {
-      for (std::uint32_t i = cell.begin; i < cell.begin + cell.count; ++i) {
+    VisitKeys(p, &best, [&](std::uint64_t key) {
+      const Cell* const cell = Find(key);
+      if (cell == nullptr) return;
+      for (std::uint32_t i = cell->begin; i < cell->begin + cell->count; ++i) {
         const float distance2 = (points_[i] - p).squaredNorm();
         if (distance2 > best) continue;
         best = distance2;
@@ -117,11 +119,24 @@ class CellHash {
   template <class Visit>
   void ForEachWithin(const Eigen::Vector3f& p, float radius, Visit&& visit) const {
     const float radius2 = radius * radius;
-    float bound = radius2;
-    VisitCells(p, &bound, [&](const Cell& cell) {
-      for (std::uint32_t i = cell.begin; i < cell.begin + cell.count; ++i)
-        if ((points_[i] - p).squaredNorm() <= radius2) visit(points_[i]);
+    std::array<std::uint64_t, 27> keys;  // fetched at once, then read
+    std::size_t count = 0;
+    VisitKeys(p, &radius2, [&](std::uint64_t key) {
+      Fetch(&table_[SlotOf(key)]);
+      keys[count++] = key;
     });
+    std::array<const Cell*, 27> cells;
+    std::size_t found = 0;
+    for (std::size_t k = 0; k < count; ++k) {
+      const Cell* const cell = Find(keys[k]);
+      if (cell == nullptr) continue;
+      Fetch(&points_[cell->begin]);
+      cells[found++] = cell;
+    }
+    for (std::size_t k = 0; k < found; ++k) {
+      for (std::uint32_t i = cells[k]->begin; i < cells[k]->begin + cells[k]->count; ++i)
+        if ((points_[i] - p).squaredNorm() <= radius2) visit(points_[i]);
+    }
   }
 
  private:
@@ -133,11 +148,11 @@ class CellHash {
   static constexpr std::uint64_t kBias = std::uint64_t{1} << 20;
   static constexpr std::size_t kAhead = 16;  ///< points whose cells are fetched before they are read
 
-  static void Fetch(const Cell* cell) {
+  static void Fetch(const void* address) {
 #if defined(__GNUC__)
-    __builtin_prefetch(cell);
+    __builtin_prefetch(address);
 #else
-    (void)cell;
+    (void)address;
 #endif
   }
 
@@ -170,10 +185,10 @@ class CellHash {
     return nullptr;
   }
 
-  /// Calls visit(cell) for p's cell and its neighbours, skipping those that are farther than the (shrinking) squared
+  /// Calls visit(key) for p's cell and its neighbours, skipping those that are farther than the (shrinking) squared
   /// bound.
   template <class Visit>
-  void VisitCells(const Eigen::Vector3f& p, const float* bound2, Visit&& visit) const {
+  void VisitKeys(const Eigen::Vector3f& p, const float* bound2, Visit&& visit) const {
     const Eigen::Vector3f home = CellOf(p);
     const Eigen::Vector3f below = p - home * side_;
     const Eigen::Vector3f above = Eigen::Vector3f::Constant(side_) - below;
@@ -189,10 +204,8 @@ class CellHash {
         if (xy2 > *bound2) continue;
         for (const int dz : kSteps) {
           if (xy2 + gap(2, dz) * gap(2, dz) > *bound2) continue;
-          const Cell* cell =
-              Find(Pack(static_cast<std::int64_t>(home.x()) + dx, static_cast<std::int64_t>(home.y()) + dy,
-                        static_cast<std::int64_t>(home.z()) + dz));
-          if (cell != nullptr) visit(*cell);
+          visit(Pack(static_cast<std::int64_t>(home.x()) + dx, static_cast<std::int64_t>(home.y()) + dy,
+                     static_cast<std::int64_t>(home.z()) + dz));
         }
       }
     }
