@@ -24,7 +24,7 @@ void TargetIndex::Open(const SegmentKey& segment, const TargetMap& map, std::siz
       items.erase(present);
     }
     const SegmentView& taken = target->views[view];
-    Insert({segment, view, taken.robot, true, is_released, taken.descriptor, map.CentroidMap(taken)});
+    Insert({segment, view, taken.robot, true, is_released, 0, taken.descriptor, map.CentroidMap(taken)});
   }
   if (!index_) return;
   if (index_->size() >= rescale_at_) {
@@ -82,14 +82,17 @@ void TargetIndex::KeepNearest(RobotIndex robot, std::size_t count, std::vector<T
   for (TargetCandidate& candidate : *candidates) candidate.segment = views_[candidate.item].segment;
 
   std::sort(candidates->begin(), candidates->end(), [](const TargetCandidate& a, const TargetCandidate& b) {
-    return std::tie(a.segment, a.distance, a.item) < std::tie(b.segment, b.distance, b.item);
+    return std::tie(a.distance, a.segment, a.item) < std::tie(b.distance, b.segment, b.item);
   });
-  const auto same = [](const TargetCandidate& a, const TargetCandidate& b) { return a.segment == b.segment; };
-  candidates->erase(std::unique(candidates->begin(), candidates->end(), same), candidates->end());
-  std::sort(candidates->begin(), candidates->end(), [](const TargetCandidate& a, const TargetCandidate& b) {
-    return std::tie(a.distance, a.segment) < std::tie(b.distance, b.segment);
-  });
-  if (count != 0 && candidates->size() > count) candidates->resize(count);
+  std::vector<bool> seen(views_.size());
+  std::size_t kept = 0;
+  for (const TargetCandidate& candidate : *candidates) {
+    const std::uint64_t first = views_[candidate.item].first;
+    if (seen[first]) continue;
+    seen[first] = true;
+    (*candidates)[kept++] = candidate;
+  }
+  candidates->resize(count == 0 ? kept : std::min(kept, count));
 }
 
 void TargetIndex::RequireSize(const Descriptor& descriptor) const {
@@ -122,7 +125,9 @@ void TargetIndex::Insert(IndexedView view) {
   }
   RequireSize(view.descriptor);
   const std::uint64_t item = views_.size();
-  items_[view.segment].push_back(item);
+  std::vector<std::uint64_t>& items = items_[view.segment];
+  view.first = items.empty() ? item : views_[items.front()].first;
+  items.push_back(item);
   index_->Insert(item, view.descriptor.cwiseProduct(weights_));
   views_.push_back(std::move(view));
 }

@@ -20,6 +20,7 @@ struct IndexedView {
   RobotIndex robot = 0;                                    ///< who took it
   bool live = false;                                       ///< false once its segment was closed
   bool released = false;                                   ///< open to that robot as well, not only to others
+  std::uint64_t first = 0;                                 ///< item of the segment's first view: the same for all of them
   Descriptor descriptor;                                   ///< unscaled
   Eigen::Vector3d centroid_map = Eigen::Vector3d::Zero();  ///< in the map (m), at the time of insertion
 };
