@@ -497,7 +497,7 @@ void BackEnd::KeepKeyframe(RobotIndex index, const Hypothesis* recognized) {
   const double spacing_m = parameters_.keyframes.spacing_m;
   if (robot.path_m - robot.keyframe_path_m < spacing_m) return;
   if (recognized != nullptr && recognized->closure.T_target_query.translation().norm() < spacing_m) {
-    robot.sightings.push_back({robot.path_m, recognized->target});
+    map_.AddSighting(index, recognized->target);
   } else {
     map_.AddKeyframe(index, robot.scan_sensor);
   }

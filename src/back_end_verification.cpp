@@ -271,7 +271,7 @@ const TrajectoryPose& BackEnd::PoseOf(const KeyframeName& keyframe) const {
 
 /// Of the key frames along the passes on which the matched segments were seen, kept or recognised there, the one nearest to the
 /// recognised place: other passes may lie where they don't belong, until a correction. None if all of them are too young.
-std::optional<BackEnd::KeyframeName> BackEnd::NearestKeyframe(RobotIndex robot, const Recognition& recognition) const {
+std::optional<KeyframeName> BackEnd::NearestKeyframe(RobotIndex robot, const Recognition& recognition) const {
   std::map<RobotIndex, std::vector<double>> seen_from_m;  // path of the poses, by robot
   for (const Correspondence& inlier : recognition.inliers) {
     const SegmentView& view = MatchedView(robot, inlier);
@@ -291,19 +291,19 @@ std::optional<BackEnd::KeyframeName> BackEnd::NearestKeyframe(RobotIndex robot, 
       nearest2 = distance2;
       nearest = keyframe;
     };
-    for (std::size_t i = 0; i < map_.Keyframes(other).size(); ++i) consider({other, i}, PoseOf({other, i}).path_m);
-    for (const Sighting& sighting : robots_[other].sightings) consider(sighting.keyframe, sighting.path_m);
+    for (std::uint32_t i = 0; i < map_.Keyframes(other).size(); ++i) consider({other, i}, PoseOf({other, i}).path_m);
+    for (const Sighting& sighting : map_.Sightings(other)) consider(sighting.keyframe, map_.Trajectory(other)[sighting.pose].path_m);
   }
   return nearest;
 }
 
 /// Of the key frames of one pass, within so much of path around one of them, the nearest to a place, if it is near enough.
-std::optional<BackEnd::KeyframeName> BackEnd::NearestKeyframeAlong(const KeyframeName& around, double along_m,
+std::optional<KeyframeName> BackEnd::NearestKeyframeAlong(const KeyframeName& around, double along_m,
                                                                    const Eigen::Vector3d& place) const {
   const double path_m = PoseOf(around).path_m;
   std::optional<KeyframeName> nearest;
   double nearest2 = parameters_.history.max_distance_m * parameters_.history.max_distance_m;
-  const auto consider = [&](std::size_t index) {
+  const auto consider = [&](std::uint32_t index) {
     const TrajectoryPose& pose = PoseOf({around.robot, index});
     if (std::abs(pose.path_m - path_m) > along_m) return false;
     const double distance2 = (pose.T_map_sensor.translation() - place).squaredNorm();
@@ -313,9 +313,9 @@ std::optional<BackEnd::KeyframeName> BackEnd::NearestKeyframeAlong(const Keyfram
     }
     return true;
   };
-  for (std::size_t i = around.index; i < map_.Keyframes(around.robot).size() && consider(i); ++i) {
+  for (std::uint32_t i = around.index; i < map_.Keyframes(around.robot).size() && consider(i); ++i) {
   }
-  for (std::size_t i = around.index; i > 0 && consider(i - 1); --i) {
+  for (std::uint32_t i = around.index; i > 0 && consider(i - 1); --i) {
   }
   return nearest;
 }
@@ -406,16 +406,16 @@ std::vector<Eigen::Vector3d> BackEnd::JoinScans(const KeyframeName& center, bool
   const std::vector<Keyframe>& keyframes = map_.Keyframes(center.robot);
   const Pose T_center_odom = PoseOf(center).T_odom_sensor.inverse();
   std::vector<Eigen::Vector3d> points;
-  const auto add = [&](std::size_t index) {
+  const auto add = [&](std::uint32_t index) {
     const Pose T_center_sensor = T_center_odom * PoseOf({center.robot, index}).T_odom_sensor;
     if (T_center_sensor.translation().norm() > parameters_.keyframes.submap_radius_m) return false;
     if (keyframes[index].scan_sensor && (with_center || index != center.index))
       for (const Eigen::Vector3f& p : *keyframes[index].scan_sensor) points.push_back(T_center_sensor * p.cast<double>());
     return true;
   };
-  for (std::size_t i = center.index; i < keyframes.size() && add(i); ++i) {
+  for (std::uint32_t i = center.index; i < keyframes.size() && add(i); ++i) {
   }
-  for (std::size_t i = center.index; i > 0 && add(i - 1); --i) {
+  for (std::uint32_t i = center.index; i > 0 && add(i - 1); --i) {
   }
   return points;
 }

@@ -15,7 +15,7 @@ TargetMap::TargetMap(const TargetMapParameters& parameters) : parameters_(parame
 RobotIndex TargetMap::RobotByName(const std::string& name) {
   const auto it = std::find_if(robots_.begin(), robots_.end(), [&](const Robot& robot) { return robot.name == name; });
   const auto index = static_cast<RobotIndex>(it - robots_.begin());
-  if (it == robots_.end()) robots_.push_back({name, {}, Pose::Identity(), {}});
+  if (it == robots_.end()) robots_.push_back({name, {}, Pose::Identity(), {}, {}});
   return index;
 }
 
@@ -41,6 +41,16 @@ void TargetMap::AddKeyframe(RobotIndex robot_index, std::shared_ptr<const Points
     throw std::invalid_argument("target map: robot '" + robot.name + "' has no pose that is newer than its last key frame");
   }
   robot.keyframes.push_back({static_cast<std::uint32_t>(robot.trajectory.size() - 1), std::move(scan_sensor)});
+}
+
+void TargetMap::AddSighting(RobotIndex robot_index, const KeyframeName& keyframe) {
+  Robot& robot = robots_.at(robot_index);
+  robots_.at(keyframe.robot).keyframes.at(keyframe.index);
+  const std::size_t known = robot.sightings.empty() ? 0 : robot.sightings.back().pose + 1;
+  if (robot.trajectory.size() <= known) {
+    throw std::invalid_argument("target map: robot '" + robot.name + "' has no pose that is newer than its last sighting");
+  }
+  robot.sightings.push_back({static_cast<std::uint32_t>(robot.trajectory.size() - 1), keyframe});
 }
 
 std::optional<Pose> TargetMap::OdometryAt(RobotIndex robot, StampNs stamp_ns) const {
@@ -155,7 +165,8 @@ std::size_t TargetMap::memory_bytes() const {
   constexpr std::size_t kTreeNodeOverhead = 4 * sizeof(void*);
   std::size_t bytes = sizeof(*this) + robots_.capacity() * sizeof(Robot);
   for (const Robot& robot : robots_) {
-    bytes += robot.trajectory.capacity() * sizeof(TrajectoryPose) + robot.keyframes.capacity() * sizeof(Keyframe);
+    bytes += robot.trajectory.capacity() * sizeof(TrajectoryPose) + robot.keyframes.capacity() * sizeof(Keyframe) +
+             robot.sightings.capacity() * sizeof(Sighting);
     for (const Keyframe& keyframe : robot.keyframes)
       if (keyframe.scan_sensor) bytes += keyframe.scan_sensor->capacity() * sizeof(Eigen::Vector3f);
   }

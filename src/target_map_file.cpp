@@ -1,6 +1,6 @@
 // The file of a target map. Little-endian throughout:
 //   magic (8 bytes), version (u32), CRC-32 of the content (u32), size of the content in bytes (u64), content.
-// The content is a list of robots with their trajectories and key frames, then a list of segments with their views, bit for bit as
+// The content is a list of robots with their trajectories, key frames and sightings, then a list of segments with their views, bit for bit as
 // they are in memory, so that a loaded map recognises exactly as before.
 
 #include <fcntl.h>
@@ -23,7 +23,7 @@ namespace incremental_segmatch {
 namespace {
 
 constexpr char kMagic[8] = {'S', 'E', 'G', 'M', 'A', 'P', '\r', '\n'};
-constexpr std::uint32_t kVersion = 2;
+constexpr std::uint32_t kVersion = 3;
 constexpr std::size_t kHeaderSize = 24;
 constexpr std::size_t kBufferSize = 1 << 20;
 
@@ -243,7 +243,7 @@ void RequireWhole(const std::vector<unsigned char>& bytes, const std::string& pa
          std::to_string(kVersion) + ": load it with a newer program, or save it with one as old as this");
   if (version == 0) fail(" is damaged: there is no version 0");
   if (version < kVersion)
-    fail(" is of version " + std::to_string(version) + ", whose maps have no key frames: make it anew");
+    fail(" is of version " + std::to_string(version) + ", whose maps lack what this one needs: make it anew");
   const auto content_size = GetLittleEndian<std::uint64_t>(bytes.data() + 16);
   const std::uint64_t present = bytes.size() - kHeaderSize;
   if (present != content_size)
@@ -342,6 +342,12 @@ void TargetMap::Save(const std::string& path) const {
       file.Put(keyframe.pose);
       PutPoints(keyframe.scan_sensor.get(), &file);
     }
+    file.Put(static_cast<std::uint64_t>(robot.sightings.size()));
+    for (const Sighting& sighting : robot.sightings) {
+      file.Put(sighting.pose);
+      file.Put(sighting.keyframe.robot);
+      file.Put(sighting.keyframe.index);
+    }
   }
   file.Put(static_cast<std::uint64_t>(segments_.size()));
   for (const auto& [key, segment] : segments_) {
@@ -357,7 +363,7 @@ void TargetMap::Save(const std::string& path) const {
 TargetMap TargetMap::Load(const std::string& path, const TargetMapParameters& parameters) {
   // Least bytes of an element of each list: what is refused here can't make a damaged count allocate more than the
   // file's size.
-  constexpr std::size_t kPose = 12 * 8, kRobot = 8 + kPose + 8 + 8, kKeyframe = 4 + 1, kSegment = 4 + 4 + 8 + 8, kView = 3 * 4 + 3 * 8 + 8 + 1;
+  constexpr std::size_t kPose = 12 * 8, kRobot = 8 + kPose + 8 + 8 + 8, kKeyframe = 4 + 1, kSighting = 3 * 4, kSegment = 4 + 4 + 8 + 8, kView = 3 * 4 + 3 * 8 + 8 + 1;
   TargetMap map(parameters);
   const std::vector<unsigned char> bytes = ReadFile(path);
   RequireWhole(bytes, path);
@@ -390,7 +396,22 @@ TargetMap TargetMap::Load(const std::string& path, const TargetMapParameters& pa
       next_pose = std::uint64_t{keyframe.pose} + 1;
       keyframe.scan_sensor = GetPoints(&reader);
     }
+    robot.sightings.resize(reader.GetCount(kSighting));
+    next_pose = 0;
+    for (Sighting& sighting : robot.sightings) {
+      sighting.pose = reader.Get<std::uint32_t>();
+      reader.Require(sighting.pose >= next_pose && sighting.pose < robot.trajectory.size(),
+                     "a sighting is no later pose of its trajectory");
+      next_pose = std::uint64_t{sighting.pose} + 1;
+      sighting.keyframe.robot = reader.Get<std::uint32_t>();
+      sighting.keyframe.index = reader.Get<std::uint32_t>();
+    }
   }
+  for (const Robot& robot : map.robots_)
+    for (const Sighting& sighting : robot.sightings)
+      reader.Require(sighting.keyframe.robot < map.robots_.size() &&
+                         sighting.keyframe.index < map.robots_[sighting.keyframe.robot].keyframes.size(),
+                     "a sighting is of no key frame");
 
   for (std::size_t segments = reader.GetCount(kSegment); segments > 0; --segments) {
     SegmentKey key;

@@ -199,11 +199,6 @@ class BackEnd {
     double path_m = 0.0;
     RangeImage image;
   };
-  // A key frame of the map.
-  struct KeyframeName {
-    RobotIndex robot = 0;
-    std::size_t index = 0;
-  };
   // How well a scan lay on the map's.
   struct Fit {
     double path_m = 0.0;
@@ -229,11 +224,6 @@ class BackEnd {
     Closure closure;
     std::vector<bool> fits;  // whether each of the scan's points lies on something there; empty without refinement
   };
-  // Where on its way a robot recognised a key frame to be so near that it kept none of its own.
-  struct Sighting {
-    double path_m = 0.0;
-    KeyframeName keyframe;
-  };
   struct Robot {
     std::string name;
     RobotIndex frame = 0;  // robots with the same value share a map frame
@@ -243,7 +233,6 @@ class BackEnd {
     double path_m = 0.0;
     double twin_path_m = -std::numeric_limits<double>::infinity();      // where a place last had a twin
     double keyframe_path_m = -std::numeric_limits<double>::infinity();  // where the last key frame was kept or sighted
-    std::vector<Sighting> sightings;  // of key frames
     Pose T_odom_sensor = Pose::Identity();      // odom without its jumps, here and in all else that is kept
     Pose T_odom_continuous = Pose::Identity();  // and the jumps
     std::shared_ptr<const Points> scan_sensor;  // of the last delta

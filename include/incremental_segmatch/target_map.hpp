@@ -52,6 +52,18 @@ struct Keyframe {
   std::shared_ptr<const Points> scan_sensor;  ///< thinned, in that pose's sensor frame; may be null
 };
 
+/// A key frame of the map.
+struct KeyframeName {
+  RobotIndex robot = 0;     ///< on whose trajectory it lies
+  std::uint32_t index = 0;  ///< among that robot's key frames
+};
+
+/// A pose of a trajectory that was recognised to be so near to a key frame that none was kept there.
+struct Sighting {
+  std::uint32_t pose = 0;  ///< index of the trajectory pose
+  KeyframeName keyframe;   ///< of any robot
+};
+
 /// What is kept.
 struct TargetMapParameters {
   std::size_t max_views = 4;  ///< kept of a segment: the newest, and the largest of the others
@@ -94,6 +106,12 @@ class TargetMap {
   /// Key frames of a robot, in order of its trajectory.
   const std::vector<Keyframe>& Keyframes(RobotIndex robot) const { return robots_.at(robot).keyframes; }
 
+  /// Notes that a robot's newest pose lies at a key frame. Throws std::invalid_argument if the robot has no pose that is
+  /// newer than its last sighting, and std::out_of_range if there is no such key frame.
+  void AddSighting(RobotIndex robot, const KeyframeName& keyframe);
+  /// Where a robot came by key frames again, in order of its trajectory.
+  const std::vector<Sighting>& Sightings(RobotIndex robot) const { return robots_.at(robot).sightings; }
+
   /// Sets the newest state of a segment, which is tracked from now on: `view` replaces the last view of its robot
   /// unless `keep_last`. Throws std::invalid_argument if the view's pose does not exist.
   void UpdateSegment(const SegmentKey& key, SegmentView view, bool keep_last, StampNs stamp_ns);
@@ -134,6 +152,7 @@ class TargetMap {
     std::vector<TrajectoryPose> trajectory;
     Pose T_map_odom = Pose::Identity();
     std::vector<Keyframe> keyframes;
+    std::vector<Sighting> sightings;
   };
   /// Orders views by their pose's stamp and keeps max_views of them.
   void TidyViews(std::vector<SegmentView>* views) const;

@@ -50,6 +50,9 @@ TargetMap RandomMap(unsigned seed, int robots, int poses, int segments) {
         auto scan = std::make_shared<Points>(random() % 50);
         for (Eigen::Vector3f& p : *scan) p << normal(random), normal(random), normal(random);
         map.AddKeyframe(robot, i % 2 == 0 ? nullptr : scan);
+      } else if (i % 3 == 2) {
+        const auto other = static_cast<RobotIndex>(random() % (robot + 1));
+        map.AddSighting(robot, {other, static_cast<std::uint32_t>(random() % map.Keyframes(other).size())});
       }
       if (i % 7 == 3) corrected.push_back({stamp_ns, RandomPose(random)});
       stamp_ns += 1 + static_cast<StampNs>(random() % 1000000);
@@ -100,6 +103,16 @@ void ExpectSameKeyframes(const TargetMap& a, const TargetMap& b, RobotIndex robo
   }
 }
 
+void ExpectSameSightings(const TargetMap& a, const TargetMap& b, RobotIndex robot) {
+  ASSERT_EQ(a.Sightings(robot).size(), b.Sightings(robot).size());
+  for (std::size_t i = 0; i < a.Sightings(robot).size(); ++i) {
+    const Sighting &was = a.Sightings(robot)[i], &is = b.Sightings(robot)[i];
+    EXPECT_EQ(was.pose, is.pose);
+    EXPECT_EQ(was.keyframe.robot, is.keyframe.robot);
+    EXPECT_EQ(was.keyframe.index, is.keyframe.index);
+  }
+}
+
 void ExpectSameView(const SegmentView& a, const SegmentView& b) {
   EXPECT_EQ(a.robot, b.robot);
   EXPECT_EQ(a.pose, b.pose);
@@ -119,6 +132,7 @@ void ExpectSame(const TargetMap& a, const TargetMap& b) {
   for (RobotIndex robot = 0; robot < a.robots(); ++robot) {
     ExpectSameTrajectory(a, b, robot);
     ExpectSameKeyframes(a, b, robot);
+    ExpectSameSightings(a, b, robot);
   }
   ASSERT_EQ(a.segments().size(), b.segments().size());
   for (auto at = a.segments().begin(), bt = b.segments().begin(); at != a.segments().end(); ++at, ++bt) {
@@ -252,11 +266,11 @@ TEST_F(TargetMapFile, WhatIsNoWholeMapOfThisVersionIsRefused) {
   ExpectRefused(whole + "x", "is damaged");
   ExpectRefused(std::string(100, 'x'), "is not a segment map");
   Bytes newer = whole;
-  newer[8] = 3;
-  ExpectRefused(newer, "is of version 3");
+  newer[8] = 4;
+  ExpectRefused(newer, "is of version 4");
   Bytes older = whole;
-  older[8] = 1;
-  ExpectRefused(older, "is of version 1");
+  older[8] = 2;
+  ExpectRefused(older, "is of version 2");
 }
 
 TEST_F(TargetMapFile, WhatIsNotThereOrNoFileIsRefused) {

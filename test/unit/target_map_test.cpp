@@ -54,7 +54,7 @@ TEST(TargetMap, NamesRobotsInTheOrderInWhichTheyCome) {
   EXPECT_THROW(map.RobotName(2), std::out_of_range);
 }
 
-TEST(TargetMap, KeepsAtMostOneKeyframeAPose) {
+TEST(TargetMap, KeepsAtMostOneKeyframeAndSightingAPose) {
   TargetMap map({});
   const RobotIndex robot = map.RobotByName("a");
   const auto scan = std::make_shared<const Points>(Points{{1.f, 2.f, 3.f}});
@@ -69,6 +69,12 @@ TEST(TargetMap, KeepsAtMostOneKeyframeAPose) {
   EXPECT_EQ(map.Keyframes(robot)[0].pose, 1u);
   EXPECT_EQ(map.Keyframes(robot)[0].scan_sensor, scan);
   EXPECT_EQ(map.Keyframes(robot)[1].pose, 2u);
+  EXPECT_THROW(map.AddSighting(robot, {0, 2}), std::out_of_range);
+  map.AddSighting(robot, {0, 0});
+  EXPECT_THROW(map.AddSighting(robot, {0, 1}), std::invalid_argument);  // the newest pose has one
+  ASSERT_EQ(map.Sightings(robot).size(), 1u);
+  EXPECT_EQ(map.Sightings(robot)[0].pose, 2u);
+  EXPECT_EQ(map.Sightings(robot)[0].keyframe.index, 0u);
 }
 
 TEST(TargetMap, RefusesStampsThatDoNotIncreaseAndPosesThatAreNotFinite) {
