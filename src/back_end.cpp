@@ -101,6 +101,8 @@ BackEnd::BackEnd(const BackEndParameters& parameters, TargetMap map, RecognizeFu
   if (!(parameters.merging.distance_m >= 0.0)) throw std::invalid_argument("back_end.merging.distance_m: must not be negative");
   if (!(parameters.merging.descriptor_distance >= 0.0))
     throw std::invalid_argument("back_end.merging.descriptor_distance: must not be negative");
+  if (parameters.forgetting.missed_visits < 0)
+    throw std::invalid_argument("back_end.forgetting.missed_visits: must not be negative");
   if (!(parameters.keyframes.spacing_m > 0.0)) throw std::invalid_argument("back_end.keyframes.spacing_m: must be positive");
   if (!(parameters.keyframes.submap_radius_m >= 0.0))
     throw std::invalid_argument("back_end.keyframes.submap_radius_m: must not be negative");
@@ -110,7 +112,10 @@ BackEnd::BackEnd(const BackEndParameters& parameters, TargetMap map, RecognizeFu
     robots_.back().name = map_.RobotName(robot);
   }
   loaded_robots_ = static_cast<RobotIndex>(robots_.size());
-  for (const auto& [key, segment] : map_.segments()) index_.Open(key, map_, segment.views.size(), true);
+  for (const auto& [key, segment] : map_.segments()) {
+    index_.Open(key, map_, segment.views.size(), true);
+    if (const std::optional<KeyframeName> keyframe = SeenFrom(segment)) places_[*keyframe].segments.insert(key);
+  }
 }
 
 BackEndStep BackEnd::Process(const SegmentDelta& delta) {
@@ -382,6 +387,7 @@ void BackEnd::UpdateSegment(RobotIndex robot_index, const SegmentState& state, c
 void BackEnd::AwaitRelease(const SegmentKey& key) {
   const TargetSegment& target = *map_.Find(key);
   for (const SegmentView& view : target.views) waiting_.emplace(map_.PoseOf(view).stamp_ns, key);
+  if (const std::optional<KeyframeName> keyframe = SeenFrom(target)) places_[*keyframe].segments.insert(key);
   if (robots_.size() > 1) index_.Open(key, map_, 0, true);
 }
 
@@ -497,11 +503,68 @@ void BackEnd::KeepKeyframe(RobotIndex index, const Hypothesis* recognized) {
   const double spacing_m = parameters_.keyframes.spacing_m;
   if (robot.path_m - robot.keyframe_path_m < spacing_m) return;
   if (recognized != nullptr && recognized->closure.T_target_query.translation().norm() < spacing_m) {
+    CountVisit(index, recognized->target);
     map_.AddSighting(index, recognized->target);
   } else {
     map_.AddKeyframe(index, robot.scan_sensor);
   }
   robot.keyframe_path_m = robot.path_m;
+}
+
+/// The robot comes by a key frame again, and so by those around it along the trajectory. O(what was seen from there).
+void BackEnd::CountVisit(RobotIndex robot, const KeyframeName& sighted) {
+  const auto keyframes = static_cast<std::uint32_t>(map_.Keyframes(sighted.robot).size());
+  const auto visit = [&](const KeyframeName& keyframe) {
+    if (std::abs(PoseOf(keyframe).path_m - PoseOf(sighted).path_m) > parameters_.keyframes.submap_radius_m) return false;
+    MissVisit(robot, keyframe);
+    return true;
+  };
+  for (std::uint32_t i = sighted.index; i < keyframes && visit({sighted.robot, i}); ++i) {
+  }
+  for (std::uint32_t i = sighted.index; i > 0 && visit({sighted.robot, i - 1}); --i) {
+  }
+}
+
+/// If this is another visit than the last one: what was seen from a key frame has a chance to be seen again now, and has missed
+/// the visit until it is, that is, recognised or found to lie there. What missed enough of them before is gone.
+void BackEnd::MissVisit(RobotIndex robot, const KeyframeName& keyframe) {
+  Place& place = places_[keyframe];
+  const auto now = static_cast<std::uint32_t>(map_.Trajectory(robot).size() - 1);
+  const auto [visit, is_first] = place.visits.try_emplace(robot, now);
+  if (!is_first && IsYoung(robot, visit->second)) return;
+  visit->second = now;
+
+  const auto limit = static_cast<std::uint32_t>(parameters_.forgetting.missed_visits);
+  std::set<SegmentKey>& seen = place.segments;
+  for (auto it = seen.begin(); it != seen.end();) {
+    TargetSegment* const segment = map_.Find(*it);
+    if (segment == nullptr || !(SeenFrom(*segment) == keyframe)) {
+      it = seen.erase(it);
+      continue;
+    }
+    if (segment->tracked || IsSeenOnThisVisit(robot, *segment)) {
+      ++it;
+    } else if (limit == 0 || segment->missed_visits < limit) {
+      ++segment->missed_visits;
+      ++it;
+    } else {
+      index_.Close(*it);
+      map_.Erase(*it);
+      it = seen.erase(it);
+    }
+  }
+}
+
+/// The key frame of the nearest look at a segment.
+std::optional<KeyframeName> BackEnd::SeenFrom(const TargetSegment& segment) const {
+  return map_.KeyframeOf(*std::min_element(segment.views.begin(), segment.views.end(), [](const SegmentView& a, const SegmentView& b) {
+    return a.centroid_sensor.squaredNorm() < b.centroid_sensor.squaredNorm();
+  }));
+}
+
+bool BackEnd::IsSeenOnThisVisit(RobotIndex robot, const TargetSegment& segment) const {
+  return std::any_of(segment.views.begin(), segment.views.end(),
+                     [&](const SegmentView& view) { return view.robot == robot && IsYoung(robot, view.pose); });
 }
 
 /// What was recognised is the same: remembered until the local segment's tracking ends.
@@ -510,6 +573,7 @@ void BackEnd::AcceptClosure(RobotIndex robot, const Closure& closure) {
   for (const SegmentMatch& match : closure.matches) {
     const auto local = robots_[robot].local.find(match.local.id);
     if (local != robots_[robot].local.end()) local->second.same_as = match.target;
+    if (TargetSegment* const target = map_.Find(match.target)) target->missed_visits = 0;
   }
   const RobotIndex target_robot = closure.matches.front().target.robot;
   if (robots_[robot].frame != robots_[target_robot].frame) JoinFrames(robot, target_robot, closure.T_map_odom);

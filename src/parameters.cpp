@@ -415,6 +415,9 @@ const std::vector<Parameter>& Table() {
              "after a correction, segments of different visits whose centroids are this near become one; 0: none do"),
       NUMBER(back_end.merging.descriptor_distance, AtLeast(0), "if their scaled descriptors differ by at most so much"),
 
+      NUMBER(back_end.forgetting.missed_visits, AtLeast(0),
+             "a segment that was not seen on so many visits in a row leaves the map when the robot comes there again; 0: none do"),
+
       NUMBER(back_end.history.length_m, AtLeast(0), "so much of path behind the robot speaks for or against a place"),
       NUMBER(back_end.history.spacing_m, Above(0), "path between the scans of it that are kept"),
       NUMBER(back_end.history.max_distance_m, Above(0), "they are held against key frames this near"),

@@ -111,6 +111,7 @@ void TargetMap::UpdateSegment(const SegmentKey& key, SegmentView view, bool keep
   TargetSegment& segment = segments_[key];
   segment.last_seen_ns = stamp_ns;
   segment.tracked = true;
+  segment.missed_visits = 0;
   if (!keep_last) {
     // The last view of this robot: after segments of two robots were merged, the other one's clock may be ahead.
     const auto last = std::find_if(segment.views.rbegin(), segment.views.rend(),
@@ -131,6 +132,7 @@ void TargetMap::MoveViews(const SegmentKey& from, const SegmentKey& to) {
   TargetSegment& segment = target->second;
   segment.last_seen_ns = is_new ? moved.last_seen_ns : std::max(segment.last_seen_ns, moved.last_seen_ns);
   segment.tracked = segment.tracked || moved.tracked;
+  segment.missed_visits = 0;
   segment.views.insert(segment.views.end(), std::make_move_iterator(moved.views.begin()),
                        std::make_move_iterator(moved.views.end()));
   TidyViews(&segment.views);
@@ -159,6 +161,17 @@ const TargetSegment* TargetMap::Find(const SegmentKey& key) const {
 
 Eigen::Vector3d TargetMap::CentroidMap(const SegmentView& view) const {
   return PoseOf(view).T_map_sensor * view.centroid_sensor;
+}
+
+std::optional<KeyframeName> TargetMap::KeyframeOf(const SegmentView& view) const {
+  const Robot& robot = robots_.at(view.robot);
+  const auto is_later = [](std::uint32_t pose, const auto& marked) { return pose < marked.pose; };
+  const auto keyframe = std::upper_bound(robot.keyframes.begin(), robot.keyframes.end(), view.pose, is_later);
+  const auto sighting = std::upper_bound(robot.sightings.begin(), robot.sightings.end(), view.pose, is_later);
+  const bool is_kept = keyframe != robot.keyframes.begin(), is_sighted = sighting != robot.sightings.begin();
+  if (is_sighted && (!is_kept || std::prev(keyframe)->pose < std::prev(sighting)->pose)) return std::prev(sighting)->keyframe;
+  if (!is_kept) return std::nullopt;
+  return KeyframeName{view.robot, static_cast<std::uint32_t>(keyframe - robot.keyframes.begin() - 1)};
 }
 
 std::size_t TargetMap::memory_bytes() const {

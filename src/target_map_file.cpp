@@ -354,6 +354,7 @@ void TargetMap::Save(const std::string& path) const {
     file.Put(key.robot);
     file.Put(key.id);
     file.Put(segment.last_seen_ns);
+    file.Put(segment.missed_visits);
     file.Put(static_cast<std::uint64_t>(segment.views.size()));
     for (const SegmentView& view : segment.views) PutView(view, &file);
   }
@@ -363,7 +364,7 @@ void TargetMap::Save(const std::string& path) const {
 TargetMap TargetMap::Load(const std::string& path, const TargetMapParameters& parameters) {
   // Least bytes of an element of each list: what is refused here can't make a damaged count allocate more than the
   // file's size.
-  constexpr std::size_t kPose = 12 * 8, kRobot = 8 + kPose + 8 + 8 + 8, kKeyframe = 4 + 1, kSighting = 3 * 4, kSegment = 4 + 4 + 8 + 8, kView = 3 * 4 + 3 * 8 + 8 + 1;
+  constexpr std::size_t kPose = 12 * 8, kRobot = 8 + kPose + 8 + 8 + 8, kKeyframe = 4 + 1, kSighting = 3 * 4, kSegment = 4 + 4 + 8 + 4 + 8, kView = 3 * 4 + 3 * 8 + 8 + 1;
   TargetMap map(parameters);
   const std::vector<unsigned char> bytes = ReadFile(path);
   RequireWhole(bytes, path);
@@ -421,6 +422,7 @@ TargetMap TargetMap::Load(const std::string& path, const TargetMapParameters& pa
     reader.Require(map.segments_.empty() || map.segments_.rbegin()->first < key, "its segments are out of order");
     TargetSegment& segment = map.segments_.emplace_hint(map.segments_.end(), key, TargetSegment())->second;
     segment.last_seen_ns = reader.Get<std::int64_t>();
+    segment.missed_visits = reader.Get<std::uint32_t>();
     const std::size_t views = reader.GetCount(kView);
     reader.Require(views > 0, "a segment has no view");
     for (std::size_t i = 0; i < views; ++i) {

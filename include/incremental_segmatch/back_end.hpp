@@ -7,6 +7,7 @@
 #include <limits>
 #include <map>
 #include <optional>
+#include <set>
 #include <string>
 #include <unordered_map>
 #include <vector>
@@ -59,6 +60,11 @@ struct MergingParameters {
   double descriptor_distance = 3.0;  ///< scaled, between these views
 };
 
+/// When a segment is gone: a car that drove away, or a piece that fell apart otherwise ever after.
+struct ForgettingParameters {
+  int missed_visits = 2;  ///< visits in a row on which it was not seen; it leaves on the next one. 0: nothing does
+};
+
 /// Of the map side.
 struct BackEndParameters {
   Mode mode = Mode::kLoopClosure;    ///< loop closure or localization
@@ -70,7 +76,8 @@ struct BackEndParameters {
   RefinementParameters refinement;   ///< of the transform, on scans
   AcceptanceParameters acceptance;   ///< evidence that a recognition must have
   TargetMapParameters target_map;    ///< what is kept
-  MergingParameters merging;         ///< and what of it is the same
+  MergingParameters merging;         ///< what of it is the same
+  ForgettingParameters forgetting;   ///< and what is gone
 };
 
 /// A matched pair of segments, for evidence and display.
@@ -241,6 +248,12 @@ class BackEnd {
     std::map<SegmentId, LocalSegment> local;
   };
 
+  // What is known of a key frame's surroundings.
+  struct Place {
+    std::set<SegmentKey> segments;  // seen from there; those that went, or were seen from elsewhere since, may be in still
+    std::map<RobotIndex, std::uint32_t> visits;  // a robot's pose at its last visit
+  };
+
   // The joined scans of a key frame and of those around it.
   struct Submap {
     KeyframeName center;
@@ -293,6 +306,10 @@ class BackEnd {
   void MeasureCoverage(RobotIndex robot, const Pose& T_map_odom, Evidence* evidence) const;
   Closure MakeClosure(RobotIndex robot, StampNs stamp_ns, const Recognition& recognition, const KeyframeName& keyframe) const;
   void KeepKeyframe(RobotIndex robot, const Hypothesis* recognized);
+  void CountVisit(RobotIndex robot, const KeyframeName& sighted);
+  void MissVisit(RobotIndex robot, const KeyframeName& keyframe);
+  std::optional<KeyframeName> SeenFrom(const TargetSegment& segment) const;
+  bool IsSeenOnThisVisit(RobotIndex robot, const TargetSegment& segment) const;
   void AcceptClosure(RobotIndex robot, const Closure& closure);
   void JoinFrames(RobotIndex robot, RobotIndex target_robot, const Pose& T_map_odom);
 
@@ -304,6 +321,7 @@ class BackEnd {
   std::vector<Robot> robots_;  // by RobotIndex; those of a loaded map come first
   RobotIndex loaded_robots_ = 0;
   std::multimap<StampNs, SegmentKey> waiting_;  // segments by when views of them were taken that are not released yet
+  std::map<KeyframeName, Place> places_;
   std::deque<Submap> submaps_;               // of the last refinements, newest first: the next one is near
 };
 

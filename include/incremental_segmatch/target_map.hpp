@@ -44,6 +44,7 @@ struct TargetSegment {
   std::vector<SegmentView> views;  ///< oldest first; never empty
   StampNs last_seen_ns = 0;        ///< stamp of the last scan that changed it
   bool tracked = false;            ///< by its robot's local map, now
+  std::uint32_t missed_visits = 0;  ///< in a row, of where it was seen from; none after UpdateSegment and MoveViews
 };
 
 /// A pose of a trajectory whose scan is kept: what recognitions are refined on and closures refer to.
@@ -57,6 +58,14 @@ struct KeyframeName {
   RobotIndex robot = 0;     ///< on whose trajectory it lies
   std::uint32_t index = 0;  ///< among that robot's key frames
 };
+/// Whether two names stand for one key frame.
+inline bool operator==(const KeyframeName& a, const KeyframeName& b) {
+  return a.robot == b.robot && a.index == b.index;
+}
+/// By robot, and along its trajectory.
+inline bool operator<(const KeyframeName& a, const KeyframeName& b) {
+  return a.robot != b.robot ? a.robot < b.robot : a.index < b.index;
+}
 
 /// A pose of a trajectory that was recognised to be so near to a key frame that none was kept there.
 struct Sighting {
@@ -135,6 +144,9 @@ class TargetMap {
   const TrajectoryPose& PoseOf(const SegmentView& view) const {
     return robots_.at(view.robot).trajectory.at(view.pose);
   }
+
+  /// The key frame that was kept or sighted last when a view was taken; none if there was none yet. O(log key frames).
+  std::optional<KeyframeName> KeyframeOf(const SegmentView& view) const;
 
   /// Memory held, about. O(map).
   std::size_t memory_bytes() const;

@@ -292,6 +292,8 @@ TEST(Parameters, EveryMemberOfEveryStructIsInTheTable) {
   EXPECT_EQ(entries("back_end.recognizer.clique"), CountMembers<MaxCliqueParameters>());
   EXPECT_EQ(entries("back_end.history"), CountMembers<HistoryParameters>());
   EXPECT_EQ(entries("back_end.free_space"), CountMembers<FreeSpaceParameters>());
+  EXPECT_EQ(entries("back_end.merging"), CountMembers<MergingParameters>());
+  EXPECT_EQ(entries("back_end.forgetting"), CountMembers<ForgettingParameters>());
   EXPECT_EQ(entries("back_end.keyframes"), CountMembers<KeyframeParameters>());
   EXPECT_EQ(entries("front_end.thinning"), CountMembers<ScanThinningParameters>());
   EXPECT_EQ(entries("front_end.trails"), CountMembers<TrailParameters>());

@@ -76,6 +76,7 @@ TargetMap RandomMap(unsigned seed, int robots, int poses, int segments) {
       }
       map.UpdateSegment(key, view, true, static_cast<StampNs>(random()) - 1000000000);
     }
+    map.Find(key)->missed_visits = static_cast<std::uint32_t>(random());
   }
   return map;
 }
@@ -138,6 +139,7 @@ void ExpectSame(const TargetMap& a, const TargetMap& b) {
   for (auto at = a.segments().begin(), bt = b.segments().begin(); at != a.segments().end(); ++at, ++bt) {
     EXPECT_EQ(at->first, bt->first);
     EXPECT_EQ(at->second.last_seen_ns, bt->second.last_seen_ns);
+    EXPECT_EQ(at->second.missed_visits, bt->second.missed_visits);
     ASSERT_EQ(at->second.views.size(), bt->second.views.size());
     for (std::size_t i = 0; i < at->second.views.size(); ++i) ExpectSameView(at->second.views[i], bt->second.views[i]);
   }

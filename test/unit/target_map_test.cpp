@@ -75,6 +75,21 @@ TEST(TargetMap, KeepsAtMostOneKeyframeAndSightingAPose) {
   ASSERT_EQ(map.Sightings(robot).size(), 1u);
   EXPECT_EQ(map.Sightings(robot)[0].pose, 2u);
   EXPECT_EQ(map.Sightings(robot)[0].keyframe.index, 0u);
+
+  const auto keyframe_at = [&](std::uint32_t pose) {
+    SegmentView view;
+    view.robot = robot;
+    view.pose = pose;
+    const std::optional<KeyframeName> keyframe = map.KeyframeOf(view);
+    return keyframe ? static_cast<int>(keyframe->index) : -1;
+  };
+  EXPECT_EQ(keyframe_at(0), -1) << "there was none yet";
+  EXPECT_EQ(keyframe_at(1), 0);
+  EXPECT_EQ(keyframe_at(2), 1) << "that which was kept there goes before that which was sighted";
+  map.AddPose(robot, 4000, Pose::Identity());
+  map.AddSighting(robot, {robot, 0});
+  map.AddPose(robot, 5000, Pose::Identity());
+  EXPECT_EQ(keyframe_at(4), 0) << "sighted last";
 }
 
 TEST(TargetMap, RefusesStampsThatDoNotIncreaseAndPosesThatAreNotFinite) {
