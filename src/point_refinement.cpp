@@ -41,6 +41,17 @@ Matrix6 Shift(const Eigen::Vector3d& center) {
   return Adjoint(Pose(Eigen::Translation3d(center)));
 }
 
+/// Points whose memory is fetched before it is read: target clouds do not fit into the second-level cache.
+constexpr std::size_t kAhead = 16;
+
+void Fetch(const void* address) {
+#if defined(__GNUC__)
+  __builtin_prefetch(address);
+#else
+  (void)address;
+#endif
+}
+
 /// Points by cubic cells: contiguous per cell, the cells in an open hash table. Finds what is within a cell's side.
 class CellHash {
  public:
@@ -146,15 +157,6 @@ class CellHash {
     std::uint32_t count = 0;  ///< 0: a free slot
   };
   static constexpr std::uint64_t kBias = std::uint64_t{1} << 20;
-  static constexpr std::size_t kAhead = 16;  ///< points whose cells are fetched before they are read
-
-  static void Fetch(const void* address) {
-#if defined(__GNUC__)
-    __builtin_prefetch(address);
-#else
-    (void)address;
-#endif
-  }
 
   static std::uint64_t Pack(std::int64_t x, std::int64_t y, std::int64_t z) {
     return (static_cast<std::uint64_t>(x) + kBias) << 42 | ((static_cast<std::uint64_t>(y) + kBias) & 0x1fffff) << 21 |
@@ -258,6 +260,12 @@ class SurfaceCloud {
 
   const CellHash& cells() const { return cells_; }
   std::size_t memory_bytes() const { return cells_.memory_bytes() + surfaces_.capacity() * sizeof(Surface); }
+  /// Fetches a point, or none, and its surface.
+  void FetchPoint(std::uint32_t point) const {
+    if (point == kNone) return;
+    Fetch(&cells_.points()[point]);
+    Fetch(&surfaces_[point]);
+  }
   const Surface& SurfaceAt(std::uint32_t point, const CellHash& cloud, float radius) {
     Surface& surface = surfaces_[point];
     if (surface.thin_directions == Surface::kUnknown) surface = EstimateSurface(cloud, cells_.points()[point], radius);
@@ -328,6 +336,7 @@ System BuildSystem(const std::vector<Eigen::Vector3f>& local, const std::vector<
   const double width2 = width_m * width_m;
   System system;
   for (std::size_t i = 0; i < local.size(); ++i) {
+    target->FetchPoint(partners[std::min(i + kAhead, local.size() - 1)]);
     if (partners[i] == kNone) continue;
     const Eigen::Vector3f p = R * local[i] + t;
     const Eigen::Vector3d difference = (p - target->cells().points()[partners[i]]).cast<double>();
