@@ -2,12 +2,7 @@
 
 #include <algorithm>
 
-// Compiled for processors that count bits in one instruction as well, and chosen at run time; the results are the same.
-#if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__gnu_linux__)
-#define SEGMATCH_SEVERAL_TARGETS __attribute__((target_clones("popcnt", "default")))
-#else
-#define SEGMATCH_SEVERAL_TARGETS
-#endif
+#include "several_targets.hpp"
 
 namespace incremental_segmatch {
 namespace {
