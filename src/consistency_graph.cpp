@@ -160,10 +160,11 @@ void Append(Range range, std::vector<Range>& ranges) {
   }
 }
 
-/// Writes those in the ranges that may be within the tolerance of i to `hits`, which has room for two more, and returns
-/// their number.
-std::size_t ScreenPortable(const ScreenArrays& arrays, std::uint32_t i, const std::vector<Range>& ranges,
-                           std::uint32_t* hits) {
+using Pair = ConsistencyGraph::Edge;
+
+/// Writes the pairs of i with those in the ranges that may be within the tolerance of it to `hits`, which has room for
+/// two more, and returns their number.
+std::size_t ScreenPortable(const ScreenArrays& arrays, std::uint32_t i, const std::vector<Range>& ranges, Pair* hits) {
   constexpr std::uint32_t kBlock = ScreenArrays::kBlock;
   std::array<float, 6> own;
   for (int k = 0; k < 6; ++k) own[k] = arrays.blocks[i / kBlock].coordinates[k][i % kBlock];
@@ -180,7 +181,7 @@ std::size_t ScreenPortable(const ScreenArrays& arrays, std::uint32_t i, const st
       }
       const std::uint32_t end = std::min(kBlock, range.end - j);
       for (std::uint32_t k = j < range.begin ? range.begin - j : 0; k < end; ++k) {
-        hits[count] = j + k;
+        hits[count] = {i, j + k};
         count += excess[k] <= 0.f ? 1 : 0;
       }
     }
@@ -192,17 +193,17 @@ std::size_t ScreenPortable(const ScreenArrays& arrays, std::uint32_t i, const st
 #define SEGMATCH_AVX2 __attribute__((target("avx2,fma,bmi,popcnt")))
 #define SEGMATCH_AVX512 __attribute__((target("avx512f,bmi,popcnt")))
 
-/// Appends j + k for each bit k of the mask and returns the new count. Most masks have at most two bits, but which ones
-/// have any is anybody's guess: without a branch for that, nothing is guessed wrongly.
-__attribute__((target("bmi,popcnt"))) inline std::size_t AppendBits(std::uint64_t mask, std::uint32_t j,
-                                                                    std::uint32_t* hits, std::size_t count) {
+/// Appends (i, j + k) for each bit k of the mask and returns the new count. Most masks have at most two bits, but which
+/// ones have any is anybody's guess: without a branch for that, nothing is guessed wrongly.
+__attribute__((target("bmi,popcnt"))) inline std::size_t AppendBits(std::uint64_t mask, std::uint32_t i,
+                                                                    std::uint32_t j, Pair* hits, std::size_t count) {
   const auto bits = static_cast<std::size_t>(_mm_popcnt_u64(mask));
-  hits[count] = j + static_cast<std::uint32_t>(_tzcnt_u64(mask));
+  hits[count] = {i, j + static_cast<std::uint32_t>(_tzcnt_u64(mask))};
   mask = _blsr_u64(mask);
-  hits[count + 1] = j + static_cast<std::uint32_t>(_tzcnt_u64(mask));
+  hits[count + 1] = {i, j + static_cast<std::uint32_t>(_tzcnt_u64(mask))};
   for (std::size_t k = 2; k < bits; ++k) {
     mask = _blsr_u64(mask);
-    hits[count + k] = j + static_cast<std::uint32_t>(_tzcnt_u64(mask));
+    hits[count + k] = {i, j + static_cast<std::uint32_t>(_tzcnt_u64(mask))};
   }
   return count + bits;
 }
@@ -264,7 +265,8 @@ SEGMATCH_AVX512 inline std::uint64_t ScreenBlock(const Own512& own, const Screen
 /// compiled.
 template <class Own>
 __attribute__((always_inline)) inline std::size_t ScreenRanges(const Own& own, const ScreenArrays& arrays,
-                                                               const std::vector<Range>& ranges, std::uint32_t* hits) {
+                                                               std::uint32_t i, const std::vector<Range>& ranges,
+                                                               Pair* hits) {
   constexpr std::uint32_t kBlock = ScreenArrays::kBlock, kAtATime = ScreenArrays::kBlocksAtATime * kBlock;
   std::size_t count = 0;
   for (const Range range : ranges) {
@@ -275,7 +277,7 @@ __attribute__((always_inline)) inline std::size_t ScreenRanges(const Own& own, c
       const std::uint64_t mask = ScreenBlock(own, block[0]) | ScreenBlock(own, block[1]) << kBlock |
                                  ScreenBlock(own, block[2]) << 2 * kBlock | ScreenBlock(own, block[3]) << 3 * kBlock;
       if (range.end - j < kAtATime) valid &= (std::uint64_t{1} << (range.end - j)) - 1;
-      count = AppendBits(mask & valid, j, hits, count);
+      count = AppendBits(mask & valid, i, j, hits, count);
       valid = ~std::uint64_t{0};
     }
   }
@@ -283,17 +285,17 @@ __attribute__((always_inline)) inline std::size_t ScreenRanges(const Own& own, c
 }
 
 SEGMATCH_AVX2 std::size_t ScreenAvx2(const ScreenArrays& arrays, std::uint32_t i, const std::vector<Range>& ranges,
-                                     std::uint32_t* hits) {
-  return ScreenRanges(Own256(arrays, i), arrays, ranges, hits);
+                                     Pair* hits) {
+  return ScreenRanges(Own256(arrays, i), arrays, i, ranges, hits);
 }
 
 SEGMATCH_AVX512 std::size_t ScreenAvx512(const ScreenArrays& arrays, std::uint32_t i, const std::vector<Range>& ranges,
-                                         std::uint32_t* hits) {
-  return ScreenRanges(Own512(arrays, i), arrays, ranges, hits);
+                                         Pair* hits) {
+  return ScreenRanges(Own512(arrays, i), arrays, i, ranges, hits);
 }
 #endif
 
-using ScreenFunction = std::size_t (*)(const ScreenArrays&, std::uint32_t, const std::vector<Range>&, std::uint32_t*);
+using ScreenFunction = std::size_t (*)(const ScreenArrays&, std::uint32_t, const std::vector<Range>&, Pair*);
 
 ScreenFunction ChooseScreen(Instructions instructions) {
 #ifdef SEGMATCH_HAS_AVX_KERNELS
@@ -330,15 +332,12 @@ class Partition {
   /// Index of the match in the list that was assigned.
   std::uint32_t index(std::uint32_t slot) const { return order_[slot]; }
 
-  /// Calls visit(slot, begin, end) for each slot, with those later ones that pass the screen: every unordered pair
-  /// once. Returns the number of pairs screened.
-  template <typename Visit>
-  std::uint64_t ForEachLater(Visit visit);
+  /// Appends the pairs of slots that pass the screen, each once, and returns how many were screened.
+  std::uint64_t FindPairs(std::vector<Pair>& pairs);
 
-  /// Calls visit(slot, begin, end) for those slots for which selected(slot), with all that pass the screen, the slot
-  /// itself among them. Returns the number of pairs screened.
-  template <typename Selected, typename Visit>
-  std::uint64_t ForEachOf(Selected selected, Visit visit);
+  /// The same for the pairs (slot, any slot, itself included) of those slots for which selected(slot).
+  template <typename Selected>
+  std::uint64_t FindPairsOf(Selected selected, std::vector<Pair>& pairs);
 
  private:
   using Index = std::int64_t;  ///< of a cell along an axis
@@ -354,8 +353,8 @@ class Partition {
     int dy, dz;
   };
 
-  static constexpr int kReach = 2;    ///< rows to a square of side b + tolerance
-  static constexpr int kColumns = 8;  ///< columns to the height of a row
+  static constexpr int kReach = 2;     ///< rows to a square of side b + tolerance
+  static constexpr int kColumns = 16;  ///< columns to the height of a row
 
   Index RowAt(double offset_m) const { return static_cast<Index>(std::max(offset_m, 0.0) * rows_per_m_); }
   Index ColumnAt(double offset_m) const {
@@ -369,8 +368,7 @@ class Partition {
   std::vector<NearRow> RowsNear(const Row& row, bool only_later) const;
   double Gap(Index cell, int step, double offset_m) const;
   Range RangeIn(const NearRow& near, const Row& own, std::uint32_t slot) const;
-  template <typename Visit>
-  std::uint64_t Screen(std::uint32_t slot, const std::vector<Range>& ranges, Visit& visit);
+  std::uint64_t Screen(std::uint32_t slot, const std::vector<Range>& ranges, std::vector<Pair>& pairs);
 
   ScreenFunction screen_;
   Layout layout_ = Layout::kOneCell;
@@ -385,7 +383,7 @@ class Partition {
   std::vector<Row> rows_;                    ///< by z, then y
   std::vector<std::uint32_t> column_begin_;  ///< first slot of each column of each row
   ScreenArrays arrays_;
-  std::vector<std::uint32_t> hits_;
+  std::vector<Pair> hits_;
 };
 
 void Partition::Assign(const std::vector<Match>& matches, double tolerance_m, Layout layout) {
@@ -514,17 +512,15 @@ Range Partition::RangeIn(const NearRow& near, const Row& own, std::uint32_t slot
   return {table[low], table[high + 1]};
 }
 
-template <typename Visit>
-std::uint64_t Partition::Screen(std::uint32_t slot, const std::vector<Range>& ranges, Visit& visit) {
+std::uint64_t Partition::Screen(std::uint32_t slot, const std::vector<Range>& ranges, std::vector<Pair>& pairs) {
   const std::size_t count = screen_(arrays_, slot, ranges, hits_.data());
-  visit(slot, hits_.data(), hits_.data() + count);
+  pairs.insert(pairs.end(), hits_.data(), hits_.data() + count);
   std::uint64_t screened = 0;
   for (const Range range : ranges) screened += range.end - range.begin;
   return screened;
 }
 
-template <typename Visit>
-std::uint64_t Partition::ForEachLater(Visit visit) {
+std::uint64_t Partition::FindPairs(std::vector<Pair>& pairs) {
   std::uint64_t screened = 0;
   std::vector<Range> ranges;
   for (const Row& row : rows_) {
@@ -536,14 +532,14 @@ std::uint64_t Partition::ForEachLater(Visit visit) {
         if (near.row == &row) range.begin = slot + 1;  // those before it have visited it
         Append(range, ranges);
       }
-      screened += Screen(slot, ranges, visit);
+      screened += Screen(slot, ranges, pairs);
     }
   }
   return screened;
 }
 
-template <typename Selected, typename Visit>
-std::uint64_t Partition::ForEachOf(Selected selected, Visit visit) {
+template <typename Selected>
+std::uint64_t Partition::FindPairsOf(Selected selected, std::vector<Pair>& pairs) {
   std::uint64_t screened = 0;
   std::vector<Range> ranges;
   for (const Row& row : rows_) {
@@ -552,7 +548,7 @@ std::uint64_t Partition::ForEachOf(Selected selected, Visit visit) {
       if (!selected(slot)) continue;
       ranges.clear();
       for (const NearRow& near : rows_near) Append(RangeIn(near, row, slot), ranges);
-      screened += Screen(slot, ranges, visit);
+      screened += Screen(slot, ranges, pairs);
     }
   }
   return screened;
@@ -734,22 +730,20 @@ void Cache::FindNewCandidates(std::vector<ConsistencyGraph::Edge>& edges) {
   const double tolerance_m = parameters_.cache_theta_m + parameters_.epsilon_m + kRounding_m;
   partition_.Assign(anchors, tolerance_m, Layout::kSquares);
   const auto is_new = [&](std::uint32_t slot) { return states_[sorted_[partition_.index(slot)]].is_new == 1; };
-  const auto visit = [&](std::uint32_t slot, std::uint32_t other_slot) {
-    if (other_slot == slot || (other_slot > slot && is_new(other_slot))) return;  // new pairs once
+  std::vector<Pair> pairs;
+  tested_pairs_ += partition_.FindPairsOf(is_new, pairs);
+  for (const auto& [slot, other_slot] : pairs) {
+    if (other_slot == slot || (other_slot > slot && is_new(other_slot))) continue;  // new pairs once
     const Match& own = partition_.match(slot);
     const Match& other = partition_.match(other_slot);
-    if (ShareSegment(own, other)) return;
+    if (ShareSegment(own, other)) continue;
     const std::uint32_t index = sorted_[partition_.index(slot)];
     const std::uint32_t other_index = sorted_[partition_.index(other_slot)];
     Candidate candidate{other_index, states_[other_index].generation, 0, 0.0};
     Test(own, 0.0, candidate);
     if (candidate.consistent) edges.emplace_back(states_[index].vertex, states_[other_index].vertex);
     tracks_[index].candidates.push_back(candidate);
-  };
-  tested_pairs_ +=
-      partition_.ForEachOf(is_new, [&](std::uint32_t slot, const std::uint32_t* first, const std::uint32_t* last) {
-        for (; first != last; ++first) visit(slot, *first);
-      });
+  }
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
@@ -905,11 +899,7 @@ void ConsistencyGraphBuilder::Impl::FindPartitioned(const Correspondences& corre
   }
   partition_.Assign(matches_, parameters_.epsilon_m, layout);
   slots_.clear();
-  found.tested_pairs =
-      partition_.ForEachLater([&](std::uint32_t slot, const std::uint32_t* first, const std::uint32_t* last) {
-        auto* pair = &*slots_.insert(slots_.end(), static_cast<std::size_t>(last - first), {slot, slot});
-        for (; first != last; ++first, ++pair) pair->second = *first;
-      });
+  found.tested_pairs = partition_.FindPairs(slots_);
   truss_finder_.DropByBound(partition_.size(), set_size, &slots_);
   const auto inconsistent = [&](const ConsistencyGraph::Edge& pair) {
     return !Consistent(partition_.match(pair.first), partition_.match(pair.second), parameters_.epsilon_m,
