@@ -333,11 +333,14 @@ class Partition {
   std::uint32_t index(std::uint32_t slot) const { return order_[slot]; }
 
   /// Appends the pairs of slots that pass the screen, each once, and returns how many were screened.
-  std::uint64_t FindPairs(std::vector<Pair>& pairs);
+  std::uint64_t FindPairs(std::vector<Pair>& pairs) {
+    return FindPairsOf([](std::uint32_t) { return true; }, true, pairs);
+  }
 
-  /// The same for the pairs (slot, any slot, itself included) of those slots for which selected(slot).
+  /// The same for the pairs (slot, any slot, itself included) of those slots for which selected(slot), or with later
+  /// slots alone.
   template <typename Selected>
-  std::uint64_t FindPairsOf(Selected selected, std::vector<Pair>& pairs);
+  std::uint64_t FindPairsOf(Selected selected, bool only_later, std::vector<Pair>& pairs);
 
  private:
   using Index = std::int64_t;  ///< of a cell along an axis
@@ -354,7 +357,7 @@ class Partition {
   };
 
   static constexpr int kReach = 2;     ///< rows to a square of side b + tolerance
-  static constexpr int kColumns = 16;  ///< columns to the height of a row
+  static constexpr int kColumns = 8;  ///< columns to the height of a row
 
   Index RowAt(double offset_m) const { return static_cast<Index>(std::max(offset_m, 0.0) * rows_per_m_); }
   Index ColumnAt(double offset_m) const {
@@ -366,8 +369,15 @@ class Partition {
   void SortIntoRows(const std::vector<Match>& matches);
   void FillColumns(const std::vector<Index>& column_of);
   std::vector<NearRow> RowsNear(const Row& row, bool only_later) const;
-  double Gap(Index cell, int step, double offset_m) const;
-  Range RangeIn(const NearRow& near, const Row& own, std::uint32_t slot) const;
+  /// Where the targets of some slots are, and how far the farthest consistent target is from any of them.
+  struct Reach {
+    Bounds targets;
+    double distance_m = 0.0;
+  };
+
+  Reach ReachOf(std::uint32_t begin, std::uint32_t end) const;
+  double Gap(Index cell, int step, const Bounds& targets, int axis) const;
+  Range RangeIn(const NearRow& near, const Row& own, const Reach& reach) const;
   std::uint64_t Screen(std::uint32_t slot, const std::vector<Range>& ranges, std::vector<Pair>& pairs);
 
   ScreenFunction screen_;
@@ -487,26 +497,34 @@ std::vector<Partition::NearRow> Partition::RowsNear(const Row& row, bool only_la
   return near;
 }
 
-/// Lower bound of the distance along one axis to the cells `step` away.
-double Partition::Gap(Index cell, int step, double offset_m) const {
+Partition::Reach Partition::ReachOf(std::uint32_t begin, std::uint32_t end) const {
+  Reach reach;
+  for (std::uint32_t slot = begin; slot < end; ++slot) {
+    reach.targets.Add(matches_[slot].target);
+    reach.distance_m = std::max(reach.distance_m, reach_m_[slot]);
+  }
+  return reach;
+}
+
+/// Lower bound of the distance along one axis from some targets in a cell to the cells `step` away.
+double Partition::Gap(Index cell, int step, const Bounds& targets, int axis) const {
   if (step == 0) return 0.0;
   const auto index = static_cast<double>(cell + step);
-  const double gap = step > 0 ? index * side_m_ - offset_m : offset_m - (index + 1.0) * side_m_;
+  const double gap = step > 0 ? index * side_m_ - (targets.high[axis] - origin_[axis])
+                              : targets.low[axis] - origin_[axis] - (index + 1.0) * side_m_;
   return std::max(gap - slack_m_, 0.0);
 }
 
-Range Partition::RangeIn(const NearRow& near, const Row& own, std::uint32_t slot) const {
+Range Partition::RangeIn(const NearRow& near, const Row& own, const Reach& reach) const {
   const Row& row = *near.row;
   if (layout_ == Layout::kOneCell) return {row.begin, row.end};
-  const Eigen::Vector3d& target = matches_[slot].target;
-  const double gap_y = Gap(own.y, near.dy, target.y() - origin_.y());
-  const double gap_z = Gap(own.z, near.dz, target.z() - origin_.z());
-  const double width_sq = reach_m_[slot] * reach_m_[slot] - gap_y * gap_y - gap_z * gap_z;
+  const double gap_y = Gap(own.y, near.dy, reach.targets, 1);
+  const double gap_z = Gap(own.z, near.dz, reach.targets, 2);
+  const double width_sq = reach.distance_m * reach.distance_m - gap_y * gap_y - gap_z * gap_z;
   if (width_sq < 0.0) return {0, 0};
   const double width = std::sqrt(width_sq) + slack_m_;
-  const double x = target.x() - origin_.x();
-  const Index low = std::max(ColumnAt(x - width), row.first_column);
-  const Index high = std::min(ColumnAt(x + width), row.last_column);
+  const Index low = std::max(ColumnAt(reach.targets.low.x() - origin_.x() - width), row.first_column);
+  const Index high = std::min(ColumnAt(reach.targets.high.x() - origin_.x() + width), row.last_column);
   if (low > high) return {0, 0};
   const std::uint32_t* const table = column_begin_.data() + row.table - row.first_column;
   return {table[low], table[high + 1]};
@@ -520,35 +538,25 @@ std::uint64_t Partition::Screen(std::uint32_t slot, const std::vector<Range>& ra
   return screened;
 }
 
-std::uint64_t Partition::FindPairs(std::vector<Pair>& pairs) {
-  std::uint64_t screened = 0;
-  std::vector<Range> ranges;
-  for (const Row& row : rows_) {
-    const std::vector<NearRow> rows_near = RowsNear(row, true);
-    for (std::uint32_t slot = row.begin; slot < row.end; ++slot) {
-      ranges.clear();
-      for (const NearRow& near : rows_near) {
-        Range range = RangeIn(near, row, slot);
-        if (near.row == &row) range.begin = slot + 1;  // those before it have visited it
-        Append(range, ranges);
-      }
-      screened += Screen(slot, ranges, pairs);
-    }
-  }
-  return screened;
-}
-
+/// The slots of a column look through the same ranges.
 template <typename Selected>
-std::uint64_t Partition::FindPairsOf(Selected selected, std::vector<Pair>& pairs) {
+std::uint64_t Partition::FindPairsOf(Selected selected, bool only_later, std::vector<Pair>& pairs) {
   std::uint64_t screened = 0;
   std::vector<Range> ranges;
   for (const Row& row : rows_) {
-    const std::vector<NearRow> rows_near = RowsNear(row, false);
-    for (std::uint32_t slot = row.begin; slot < row.end; ++slot) {
-      if (!selected(slot)) continue;
+    const std::vector<NearRow> rows_near = RowsNear(row, only_later);
+    const std::uint32_t* const table = column_begin_.data() + row.table;
+    for (Index column = 0; column <= row.last_column - row.first_column; ++column) {
+      const std::uint32_t begin = table[column], end = table[column + 1];
+      if (begin == end) continue;
+      const Reach reach = ReachOf(begin, end);
       ranges.clear();
-      for (const NearRow& near : rows_near) Append(RangeIn(near, row, slot), ranges);
-      screened += Screen(slot, ranges, pairs);
+      for (const NearRow& near : rows_near) Append(RangeIn(near, row, reach), ranges);
+      for (std::uint32_t slot = begin; slot < end; ++slot) {
+        if (!selected(slot)) continue;
+        if (only_later) ranges.front().begin = slot + 1;  // of the own row, which comes first
+        screened += Screen(slot, ranges, pairs);
+      }
     }
   }
   return screened;
@@ -731,7 +739,7 @@ void Cache::FindNewCandidates(std::vector<ConsistencyGraph::Edge>& edges) {
   partition_.Assign(anchors, tolerance_m, Layout::kSquares);
   const auto is_new = [&](std::uint32_t slot) { return states_[sorted_[partition_.index(slot)]].is_new == 1; };
   std::vector<Pair> pairs;
-  tested_pairs_ += partition_.FindPairsOf(is_new, pairs);
+  tested_pairs_ += partition_.FindPairsOf(is_new, false, pairs);
   for (const auto& [slot, other_slot] : pairs) {
     if (other_slot == slot || (other_slot > slot && is_new(other_slot))) continue;  // new pairs once
     const Match& own = partition_.match(slot);

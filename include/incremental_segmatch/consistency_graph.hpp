@@ -92,9 +92,10 @@ bool AreConsistent(const Correspondence& a, const Correspondence& b, double epsi
 /// Every method returns the same edges, those for which AreConsistent holds.
 ///
 /// Squares: the grid has squares of side b + epsilon, b an upper bound of the 3-D distance between any two local
-/// centroids, each divided into two rows of thirty-two columns; a correspondence looks only as far as its own local
-/// centroid is from the farthest other one. Pairs are screened in single precision, relative to the middle of each map,
-/// with a tolerance widened by the rounding that the maps' extents allow; the predicate decides on what remains.
+/// centroids, each divided into two rows of sixteen columns; the correspondences of a column look only as far as the
+/// farthest other local centroid is from any of theirs. Pairs are screened in single precision, relative to the middle
+/// of each map, with a tolerance widened by the rounding that the maps' extents allow; the predicate decides on what
+/// remains.
 ///
 /// Cache: a correspondence (by the keys of both segments) keeps those candidates for which |d_l - d_t| between the
 /// anchors, where both were when they were cached, is at most theta + epsilon. It is cached anew once the drifts of its
