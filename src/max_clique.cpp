@@ -276,6 +276,7 @@ NamedGraph Subgraph(const ConsistencyGraph& graph, Keep keep) {
 /// Without edges that are in no clique of `size` vertices; nothing where none is known to be.
 std::optional<NamedGraph> WithoutUnsupportedEdges(const ConsistencyGraph& graph, std::size_t size,
                                                   TrussFinder* finder) {
+  if (!TrussFinder::HasBounds(graph.vertices(), graph.edges)) return std::nullopt;
   Edges edges;
   edges.reserve(graph.edges);
   for (std::uint32_t v = 0; v < graph.vertices(); ++v) {

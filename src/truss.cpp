@@ -33,8 +33,12 @@ NamedGraph WithoutLoneVertices(std::size_t vertices, Edges edges) {
   return kept;
 }
 
+bool TrussFinder::HasBounds(std::size_t vertices, std::size_t edges) {
+  return edges <= kSketchWords * kWordBits / 4 * vertices;  // half of a sketch's bits are set, in the mean
+}
+
 void TrussFinder::DropByBound(std::size_t vertices, std::size_t k, Edges* edges) {
-  if (k < 3) return;
+  if (k < 3 || !HasBounds(vertices, edges->size())) return;
   for (bool pays = true; pays;) {
     const std::size_t before = edges->size();
     Fold(vertices, *edges);

@@ -29,6 +29,8 @@ class TrussFinder {
  public:
   static constexpr std::size_t kSketchWords = 8;  ///< a cache line
 
+  /// Whether a graph is so sparse that bits alone tell something.
+  static bool HasBounds(std::size_t vertices, std::size_t edges);
   /// Drops edges for which bits alone tell that they are not in the k-truss, in sparse graphs nearly all of these.
   /// O(vertices + edges).
   void DropByBound(std::size_t vertices, std::size_t k, Edges* edges);
