@@ -513,16 +513,13 @@ void BackEnd::KeepKeyframe(RobotIndex index, const Hypothesis* recognized) {
 
 /// The robot comes by a key frame again, and so by those around it along the trajectory. O(what was seen from there).
 void BackEnd::CountVisit(RobotIndex robot, const KeyframeName& sighted) {
-  const auto keyframes = static_cast<std::uint32_t>(map_.Keyframes(sighted.robot).size());
-  const auto visit = [&](const KeyframeName& keyframe) {
-    if (std::abs(PoseOf(keyframe).path_m - PoseOf(sighted).path_m) > parameters_.keyframes.submap_radius_m) return false;
+  const double path_m = PoseOf(sighted).path_m;
+  VisitAlong(sighted, [&](std::uint32_t index) {
+    const KeyframeName keyframe{sighted.robot, index};
+    if (std::abs(PoseOf(keyframe).path_m - path_m) > parameters_.keyframes.submap_radius_m) return false;
     MissVisit(robot, keyframe);
     return true;
-  };
-  for (std::uint32_t i = sighted.index; i < keyframes && visit({sighted.robot, i}); ++i) {
-  }
-  for (std::uint32_t i = sighted.index; i > 0 && visit({sighted.robot, i - 1}); --i) {
-  }
+  });
 }
 
 /// If this is another visit than the last one: what was seen from a key frame has a chance to be seen again now, and has missed

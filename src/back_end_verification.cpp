@@ -303,7 +303,7 @@ std::optional<KeyframeName> BackEnd::NearestKeyframeAlong(const KeyframeName& ar
   const double path_m = PoseOf(around).path_m;
   std::optional<KeyframeName> nearest;
   double nearest2 = parameters_.history.max_distance_m * parameters_.history.max_distance_m;
-  const auto consider = [&](std::uint32_t index) {
+  VisitAlong(around, [&](std::uint32_t index) {
     const TrajectoryPose& pose = PoseOf({around.robot, index});
     if (std::abs(pose.path_m - path_m) > along_m) return false;
     const double distance2 = (pose.T_map_sensor.translation() - place).squaredNorm();
@@ -312,11 +312,7 @@ std::optional<KeyframeName> BackEnd::NearestKeyframeAlong(const KeyframeName& ar
       nearest = KeyframeName{around.robot, index};
     }
     return true;
-  };
-  for (std::uint32_t i = around.index; i < map_.Keyframes(around.robot).size() && consider(i); ++i) {
-  }
-  for (std::uint32_t i = around.index; i > 0 && consider(i - 1); --i) {
-  }
+  });
   return nearest;
 }
 
@@ -406,17 +402,13 @@ std::vector<Eigen::Vector3d> BackEnd::JoinScans(const KeyframeName& center, bool
   const std::vector<Keyframe>& keyframes = map_.Keyframes(center.robot);
   const Pose T_center_odom = PoseOf(center).T_odom_sensor.inverse();
   std::vector<Eigen::Vector3d> points;
-  const auto add = [&](std::uint32_t index) {
+  VisitAlong(center, [&](std::uint32_t index) {
     const Pose T_center_sensor = T_center_odom * PoseOf({center.robot, index}).T_odom_sensor;
     if (T_center_sensor.translation().norm() > parameters_.keyframes.submap_radius_m) return false;
     if (keyframes[index].scan_sensor && (with_center || index != center.index))
       for (const Eigen::Vector3f& p : *keyframes[index].scan_sensor) points.push_back(T_center_sensor * p.cast<double>());
     return true;
-  };
-  for (std::uint32_t i = center.index; i < keyframes.size() && add(i); ++i) {
-  }
-  for (std::uint32_t i = center.index; i > 0 && add(i - 1); --i) {
-  }
+  });
   return points;
 }
 

@@ -859,9 +859,16 @@ class ConsistencyGraphBuilder::Impl {
       : parameters_(parameters), partition_(parameters.instructions), cache_(parameters) {}
 
   ConsistentPairs FindPairs(const Correspondences& correspondences, std::size_t set_size) {
-    ConsistencyMethod method = parameters_.method;
-    if (method == ConsistencyMethod::kAuto) method = chooser_.Next(correspondences.size());
+    if (parameters_.method != ConsistencyMethod::kAuto) return FindWith(parameters_.method, correspondences, set_size);
+    const ConsistencyMethod fastest = chooser_.Next(correspondences.size());
     const double start_ms = ThreadCpuMs();
+    ConsistentPairs found = FindWith(fastest, correspondences, set_size);
+    chooser_.Report(fastest, (ThreadCpuMs() - start_ms) / static_cast<double>(correspondences.size() + 1));
+    return found;
+  }
+
+ private:
+  ConsistentPairs FindWith(ConsistencyMethod method, const Correspondences& correspondences, std::size_t set_size) {
     ConsistentPairs found;
     if (method == ConsistencyMethod::kCached) {
       found.tested_pairs = cache_.FindPairs(correspondences, found.pairs);
@@ -870,11 +877,9 @@ class ConsistencyGraphBuilder::Impl {
     } else {
       FindPartitioned(correspondences, set_size, LayoutOf(method), found);
     }
-    chooser_.Report(method, (ThreadCpuMs() - start_ms) / static_cast<double>(correspondences.size() + 1));
     return found;
   }
 
- private:
   static Layout LayoutOf(ConsistencyMethod method) {
     if (method == ConsistencyMethod::kPartitioned2D) return Layout::kSquares;
     return method == ConsistencyMethod::kPartitioned3D ? Layout::kCubes : Layout::kOneCell;

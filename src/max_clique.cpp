@@ -1,7 +1,6 @@
 #include "incremental_segmatch/max_clique.hpp"
 
 #include <algorithm>
-#include <array>
 #include <iterator>
 #include <limits>
 #include <numeric>

@@ -44,14 +44,6 @@ Matrix6 Shift(const Eigen::Vector3d& center) {
 /// Points whose memory is fetched before it is read: target clouds do not fit into the second-level cache.
 constexpr std::size_t kAhead = 16;
 
-void Fetch(const void* address) {
-#if defined(__GNUC__)
-  __builtin_prefetch(address);
-#else
-  (void)address;
-#endif
-}
-
 /// Points by cubic cells: contiguous per cell, the cells in an open hash table. Finds what is within a cell's side.
 class CellHash {
  public:
@@ -67,7 +59,7 @@ class CellHash {
       table_.assign(slots, {});
       used_.clear();
       for (std::size_t i = 0; i < points.size(); ++i) {
-        Fetch(&table_[SlotOf(keys[i + kAhead])]);
+        __builtin_prefetch(&table_[SlotOf(keys[i + kAhead])]);
         slot_of[i] = FindOrAdd(keys[i]);
         ++table_[slot_of[i]].count;
       }
@@ -83,7 +75,7 @@ class CellHash {
     }
     points_.resize(points.size());
     for (std::size_t i = 0; i < points.size(); ++i) {
-      Fetch(&table_[slot_of[std::min(i + kAhead, points.size() - 1)]]);
+      __builtin_prefetch(&table_[slot_of[std::min(i + kAhead, points.size() - 1)]]);
       Cell& cell = table_[slot_of[i]];
       points_[cell.begin + cell.count++] = points[i];
     }
@@ -133,7 +125,7 @@ class CellHash {
     std::array<std::uint64_t, 27> keys;  // fetched at once, then read
     std::size_t count = 0;
     VisitKeys(p, &radius2, [&](std::uint64_t key) {
-      Fetch(&table_[SlotOf(key)]);
+      __builtin_prefetch(&table_[SlotOf(key)]);
       keys[count++] = key;
     });
     std::array<const Cell*, 27> cells;
@@ -141,7 +133,7 @@ class CellHash {
     for (std::size_t k = 0; k < count; ++k) {
       const Cell* const cell = Find(keys[k]);
       if (cell == nullptr) continue;
-      Fetch(&points_[cell->begin]);
+      __builtin_prefetch(&points_[cell->begin]);
       cells[found++] = cell;
     }
     for (std::size_t k = 0; k < found; ++k) {
@@ -263,8 +255,8 @@ class SurfaceCloud {
   /// Fetches a point, or none, and its surface.
   void FetchPoint(std::uint32_t point) const {
     if (point == kNone) return;
-    Fetch(&cells_.points()[point]);
-    Fetch(&surfaces_[point]);
+    __builtin_prefetch(&cells_.points()[point]);
+    __builtin_prefetch(&surfaces_[point]);
   }
   const Surface& SurfaceAt(std::uint32_t point, const CellHash& cloud, float radius) {
     Surface& surface = surfaces_[point];

@@ -295,6 +295,14 @@ class BackEnd {
   double ExpectedOverlap(const KeyframeName& keyframe);
   const SegmentView& MatchedView(RobotIndex robot, const Correspondence& inlier) const;
   const TrajectoryPose& PoseOf(const KeyframeName& keyframe) const;
+  // Calls visit(index) for a key frame and for those around it along its trajectory, either way as long as it is true.
+  template <typename Visit>
+  void VisitAlong(const KeyframeName& around, Visit visit) const {
+    for (std::uint32_t i = around.index; i < map_.Keyframes(around.robot).size() && visit(i); ++i) {
+    }
+    for (std::uint32_t i = around.index; i > 0 && visit(i - 1); --i) {
+    }
+  }
   std::optional<KeyframeName> NearestKeyframeAlong(const KeyframeName& around, double along_m, const Eigen::Vector3d& place) const;
   void MeasureContradiction(RobotIndex robot, const KeyframeName& target, const Closure& closure, Evidence* evidence) const;
   void KeepHistory(RobotIndex robot);

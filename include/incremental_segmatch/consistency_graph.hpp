@@ -49,9 +49,8 @@ struct ConsistencyGraph {
 
 /// Which correspondences agree.
 struct ConsistentPairs {
-  std::vector<ConsistencyGraph::Edge>
-      pairs;                       ///< indices of correspondences, each pair once, in any order and direction
-  std::uint64_t tested_pairs = 0;  ///< how many pairs were tested for consistency
+  std::vector<ConsistencyGraph::Edge> pairs;  ///< of indices, each once, in any order and direction
+  std::uint64_t tested_pairs = 0;             ///< how many pairs were tested for consistency
 };
 
 /// How the pairs to be tested are found. Every method returns the same edges.
@@ -113,9 +112,9 @@ class ConsistencyGraphBuilder {
   /// Moves likewise.
   ConsistencyGraphBuilder& operator=(ConsistencyGraphBuilder&&) noexcept;
 
-  /// The pairs that may be in a consistent set of `set_size` correspondences: those that are, together with any
-  /// correspondence of set_size - 2 others, three consistent pairs which are likewise (the truss of that order). All
-  /// consistent pairs for a set of two. A correspondence without usable coordinates is in none.
+  /// The pairs that may be in a consistent set of `set_size` correspondences: the consistent ones whose two have
+  /// set_size - 2 others in common with which both are such pairs again (the truss of that order). All consistent pairs
+  /// for a set of two. A correspondence without usable coordinates is in none.
   ConsistentPairs FindPairs(const Correspondences& correspondences, std::size_t set_size);
 
   /// All consistent pairs as a graph, whose vertex i is correspondences[i].

@@ -76,6 +76,21 @@ const std::map<std::string, ConsistencyMethod>& Methods() {
   return methods;
 }
 
+/// One for each method and for all instructions.
+std::map<std::string, ConsistencyGraphBuilder> Builders(ConsistencyParameters parameters) {
+  std::map<std::string, ConsistencyGraphBuilder> builders;
+  for (const auto& [name, method] : Methods()) {
+    parameters.method = method;
+    for (const auto& [suffix, instructions] : {std::make_pair("", Instructions::kAvx512),
+                                               std::make_pair(", AVX2", Instructions::kAvx2),
+                                               std::make_pair(", portable", Instructions::kPortable)}) {
+      parameters.instructions = instructions;
+      builders.emplace(name + suffix, parameters);
+    }
+  }
+  return builders;
+}
+
 /// Segments that move, are renamed, vanish and appear while correspondences come and go.
 class RandomSequence {
  public:
@@ -189,16 +204,7 @@ TEST(ConsistencyGraph, EveryMethodGivesTheEdgesOfTheDefinition) {
   for (unsigned seed = 0; seed < 1000; ++seed) {
     SCOPED_TRACE("seed " + std::to_string(seed));
     RandomSequence sequence(seed);
-    std::map<std::string, ConsistencyGraphBuilder> builders;
-    for (const auto& [name, method] : Methods()) {
-      ConsistencyParameters parameters = sequence.parameters();
-      parameters.method = method;
-      builders.emplace(name, parameters);
-      parameters.instructions = Instructions::kAvx2;
-      builders.emplace(name + ", AVX2", parameters);
-      parameters.instructions = Instructions::kPortable;
-      builders.emplace(name + ", portable", parameters);
-    }
+    std::map<std::string, ConsistencyGraphBuilder> builders = Builders(sequence.parameters());
     for (int step = 0; step < 8; ++step) {
       SCOPED_TRACE("step " + std::to_string(step));
       const Correspondences correspondences = sequence.Current();
@@ -245,12 +251,7 @@ TEST(ConsistencyGraph, EveryMethodFindsThePairsThatSetsMayHold) {
   for (unsigned seed = 2000; seed < 2150; ++seed) {
     SCOPED_TRACE("seed " + std::to_string(seed));
     RandomSequence sequence(seed);
-    std::map<std::string, ConsistencyGraphBuilder> builders;
-    for (const auto& [name, method] : Methods()) {
-      ConsistencyParameters parameters = sequence.parameters();
-      parameters.method = method;
-      builders.emplace(name, parameters);
-    }
+    std::map<std::string, ConsistencyGraphBuilder> builders = Builders(sequence.parameters());
     for (int step = 0; step < 4; ++step) {
       const Correspondences correspondences = sequence.Current();
       const EdgeSet edges = ExpectedEdges(correspondences, sequence.parameters());
