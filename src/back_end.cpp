@@ -101,8 +101,9 @@ BackEnd::BackEnd(const BackEndParameters& parameters, TargetMap map, RecognizeFu
   if (!(parameters.merging.distance_m >= 0.0)) throw std::invalid_argument("back_end.merging.distance_m: must not be negative");
   if (!(parameters.merging.descriptor_distance >= 0.0))
     throw std::invalid_argument("back_end.merging.descriptor_distance: must not be negative");
-  if (parameters.forgetting.missed_visits < 0)
-    throw std::invalid_argument("back_end.forgetting.missed_visits: must not be negative");
+  const ForgettingParameters& forgetting = parameters.forgetting;
+  if (forgetting.missed_visits < 0) throw std::invalid_argument("back_end.forgetting.missed_visits: must not be negative");
+  if (forgetting.min_views < 0) throw std::invalid_argument("back_end.forgetting.min_views: must not be negative");
   if (!(parameters.keyframes.spacing_m > 0.0)) throw std::invalid_argument("back_end.keyframes.spacing_m: must be positive");
   if (!(parameters.keyframes.submap_radius_m >= 0.0))
     throw std::invalid_argument("back_end.keyframes.submap_radius_m: must not be negative");
@@ -134,6 +135,7 @@ BackEndStep BackEnd::Process(const SegmentDelta& delta) {
     ApplyDelta(InContinuousFrame(delta), robot);
   }
   ReleaseTargets(delta.stamp_ns);
+  EndVisits(robot);
   timer.Lap("target_update");
   return AttemptRecognition(robot, std::move(timer));
 }
@@ -523,33 +525,55 @@ void BackEnd::CountVisit(RobotIndex robot, const KeyframeName& sighted) {
 }
 
 /// If this is another visit than the last one: what was seen from a key frame has a chance to be seen again now, and has missed
-/// the visit until it is, that is, recognised or found to lie there. What missed enough of them before is gone.
+/// the visit until it is, that is, recognised or found to lie there.
 void BackEnd::MissVisit(RobotIndex robot, const KeyframeName& keyframe) {
   Place& place = places_[keyframe];
   const auto now = static_cast<std::uint32_t>(map_.Trajectory(robot).size() - 1);
   const auto [visit, is_first] = place.visits.try_emplace(robot, now);
   if (!is_first && IsYoung(robot, visit->second)) return;
   visit->second = now;
+  robots_[robot].revisits.push_back({now, keyframe});
+  for (const SegmentKey& key : SegmentsSeenFrom(keyframe)) {
+    TargetSegment* const segment = map_.Find(key);
+    if (!segment->tracked && !IsSeenOnThisVisit(robot, *segment)) ++segment->missed_visits;
+  }
+}
 
-  const auto limit = static_cast<std::uint32_t>(parameters_.forgetting.missed_visits);
-  std::set<SegmentKey>& seen = place.segments;
-  for (auto it = seen.begin(); it != seen.end();) {
-    TargetSegment* const segment = map_.Find(*it);
-    if (segment == nullptr || !(SeenFrom(*segment) == keyframe)) {
-      it = seen.erase(it);
-      continue;
-    }
-    if (segment->tracked || IsSeenOnThisVisit(robot, *segment)) {
-      ++it;
-    } else if (limit == 0 || segment->missed_visits < limit) {
-      ++segment->missed_visits;
-      ++it;
-    } else {
-      index_.Close(*it);
-      map_.Erase(*it);
-      it = seen.erase(it);
+/// When a visit is over, that is, when what was seen on it is open to matching: what has missed enough visits in a row is gone,
+/// and so is what it added to a known place without a second look.
+void BackEnd::EndVisits(RobotIndex robot) {
+  std::deque<Revisit>& revisits = robots_[robot].revisits;
+  for (; !revisits.empty() && !IsYoung(robot, revisits.front().pose); revisits.pop_front()) {
+    for (const SegmentKey& key : SegmentsSeenFrom(revisits.front().keyframe)) {
+      const TargetSegment& segment = *map_.Find(key);
+      if (!HasMissedEnough(segment) && !IsGlimpse(robot, revisits.front(), segment)) continue;
+      index_.Close(key);
+      map_.Erase(key);
     }
   }
+}
+
+bool BackEnd::HasMissedEnough(const TargetSegment& segment) const {
+  const int limit = parameters_.forgetting.missed_visits;
+  return limit > 0 && segment.missed_visits >= static_cast<std::uint32_t>(limit);
+}
+
+/// Whether a segment is known by a few looks on this visit alone.
+bool BackEnd::IsGlimpse(RobotIndex robot, const Revisit& revisit, const TargetSegment& segment) const {
+  const std::size_t enough = std::min(static_cast<std::size_t>(parameters_.forgetting.min_views), parameters_.target_map.max_views);
+  return segment.views.size() < enough &&
+         std::all_of(segment.views.begin(), segment.views.end(),
+                     [&](const SegmentView& view) { return view.robot == robot && view.pose >= revisit.pose; });
+}
+
+/// Segments of the map whose nearest look was from a key frame. What went, or was seen from elsewhere since, is struck off the list.
+std::vector<SegmentKey> BackEnd::SegmentsSeenFrom(const KeyframeName& keyframe) {
+  std::set<SegmentKey>& seen = places_[keyframe].segments;
+  for (auto it = seen.begin(); it != seen.end();) {
+    const TargetSegment* const segment = map_.Find(*it);
+    it = segment != nullptr && SeenFrom(*segment) == keyframe ? std::next(it) : seen.erase(it);
+  }
+  return {seen.begin(), seen.end()};
 }
 
 /// The key frame of the nearest look at a segment.

@@ -60,9 +60,11 @@ struct MergingParameters {
   double descriptor_distance = 3.0;  ///< scaled, between these views
 };
 
-/// When a segment is gone: a car that drove away, or a piece that fell apart otherwise ever after.
+/// When a segment is gone: a car that drove away, a piece that fell apart otherwise ever after, or one that was hardly there.
 struct ForgettingParameters {
-  int missed_visits = 2;  ///< visits in a row on which it was not seen; it leaves on the next one. 0: nothing does
+  int missed_visits = 2;  ///< visits in a row on which it was not seen: it leaves after the last of them; 0: never
+  int min_views = 2;      ///< of what is new where the robot has been before, or it leaves after that visit: so many, or
+                          ///< all that can be kept of a segment, if these are fewer; 0 or 1: any
 };
 
 /// Of the map side.
@@ -231,6 +233,11 @@ class BackEnd {
     Closure closure;
     std::vector<bool> fits;  // whether each of the scan's points lies on something there; empty without refinement
   };
+  // That a robot came by a key frame again.
+  struct Revisit {
+    std::uint32_t pose = 0;  // of the robot when it began
+    KeyframeName keyframe;
+  };
   struct Robot {
     std::string name;
     RobotIndex frame = 0;  // robots with the same value share a map frame
@@ -245,6 +252,7 @@ class BackEnd {
     std::shared_ptr<const Points> scan_sensor;  // of the last delta
     std::deque<PastScan> history;
     std::vector<Track> tracks;
+    std::deque<Revisit> revisits;  // that are not over, oldest first
     std::map<SegmentId, LocalSegment> local;
   };
 
@@ -316,6 +324,10 @@ class BackEnd {
   void KeepKeyframe(RobotIndex robot, const Hypothesis* recognized);
   void CountVisit(RobotIndex robot, const KeyframeName& sighted);
   void MissVisit(RobotIndex robot, const KeyframeName& keyframe);
+  void EndVisits(RobotIndex robot);
+  bool HasMissedEnough(const TargetSegment& segment) const;
+  bool IsGlimpse(RobotIndex robot, const Revisit& revisit, const TargetSegment& segment) const;
+  std::vector<SegmentKey> SegmentsSeenFrom(const KeyframeName& keyframe);
   std::optional<KeyframeName> SeenFrom(const TargetSegment& segment) const;
   bool IsSeenOnThisVisit(RobotIndex robot, const TargetSegment& segment) const;
   void AcceptClosure(RobotIndex robot, const Closure& closure);
