@@ -446,20 +446,8 @@ bool BackEnd::MatchSegment(RobotIndex robot, LocalSegment* segment) const {
   } else {
     for (std::uint64_t item = segment->next_item; item < index_.next_item(); ++item) {
       if (!index_.IsOpen(item, robot)) continue;
-      const TargetCandidate added{item, index_.view(item).segment, index_.Distance(segment->queried, index_.view(item).descriptor)};
-      if (added.distance > max_distance) continue;
-      const auto same = std::find_if(candidates.begin(), candidates.end(),
-                                     [&](const TargetCandidate& c) { return c.segment == added.segment; });
-      if (same != candidates.end()) {
-        if (same->distance <= added.distance) continue;
-        candidates.erase(same);
-      }
-      candidates.insert(std::upper_bound(candidates.begin(), candidates.end(), added,
-                                         [](const TargetCandidate& a, const TargetCandidate& b) {
-                                           return std::tie(a.distance, a.segment) < std::tie(b.distance, b.segment);
-                                         }),
-                        added);
-      if (nearest != 0 && candidates.size() > nearest) candidates.pop_back();
+      const float distance = index_.Distance(segment->queried, index_.descriptor(item));
+      if (distance <= max_distance) TakeIn({item, index_.view(item).segment, distance}, nearest, &candidates);
     }
   }
   segment->next_item = index_.next_item();
@@ -472,7 +460,7 @@ std::map<RobotIndex, Correspondences> BackEnd::CollectCorrespondences(RobotIndex
     for (const TargetCandidate& candidate : segment.candidates) {
       const IndexedView& view = index_.view(candidate.item);
       by_frame[robots_[view.segment.robot].frame].push_back(
-          {{robot, id}, view.segment, segment.centroid_odom, view.centroid_map, candidate.distance});
+          {{robot, id}, view.segment, segment.centroid_odom, index_.centroid_map(candidate.item), candidate.distance});
     }
   return by_frame;
 }

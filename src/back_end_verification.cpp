@@ -258,11 +258,7 @@ void BackEnd::MeasureCoverage(RobotIndex robot, const Pose& T_map_odom, Evidence
     reach_m = std::max(reach_m, (local.back() - place).norm());
   }
   reach_m += parameters_.acceptance.neighbourhood_m;
-  std::vector<Eigen::Vector3d> target;
-  for (std::uint64_t item = 0; item < index_.next_item(); ++item)
-    if (index_.IsOpen(item, robot) && (index_.view(item).centroid_map - place).squaredNorm() <= reach_m * reach_m)
-      target.push_back(index_.view(item).centroid_map);
-  incremental_segmatch::MeasureCoverage(local, target, parameters_.acceptance, evidence);
+  incremental_segmatch::MeasureCoverage(local, index_.CentroidsAround(place, reach_m, robot), parameters_.acceptance, evidence);
 }
 
 const TrajectoryPose& BackEnd::PoseOf(const KeyframeName& keyframe) const {
@@ -272,27 +268,28 @@ const TrajectoryPose& BackEnd::PoseOf(const KeyframeName& keyframe) const {
 /// Of the key frames along the passes on which the matched segments were seen, kept or recognised there, the one nearest to the
 /// recognised place: other passes may lie where they don't belong, until a correction. None if all of them are too young.
 std::optional<KeyframeName> BackEnd::NearestKeyframe(RobotIndex robot, const Recognition& recognition) const {
-  std::map<RobotIndex, std::vector<double>> seen_from_m;  // path of the poses, by robot
+  std::map<RobotIndex, std::set<double>> seen_from_m;  // path of the poses, by robot
   for (const Correspondence& inlier : recognition.inliers) {
     const SegmentView& view = MatchedView(robot, inlier);
-    seen_from_m[view.robot].push_back(map_.PoseOf(view).path_m);
+    seen_from_m[view.robot].insert(map_.PoseOf(view).path_m);
   }
   const Eigen::Vector3d place = recognition.T_target_local * robots_[robot].T_odom_sensor.translation();
+  const double reach_m = parameters_.keyframes.reach_m;
   std::optional<KeyframeName> nearest;
   double nearest2 = std::numeric_limits<double>::infinity();
-  for (auto& [other, paths_m] : seen_from_m) {
-    std::sort(paths_m.begin(), paths_m.end());
-    const auto consider = [&, &paths_m = paths_m](const KeyframeName& keyframe, double path_m) {
-      const double distance2 = (PoseOf(keyframe).T_map_sensor.translation() - place).squaredNorm();
-      if (distance2 >= nearest2) return;
-      const auto next = std::lower_bound(paths_m.begin(), paths_m.end(), path_m - parameters_.keyframes.reach_m);
-      if (next == paths_m.end() || *next > path_m + parameters_.keyframes.reach_m) return;
-      if (keyframe.robot == robot && IsYoung(robot, map_.Keyframes(robot)[keyframe.index].pose)) return;
-      nearest2 = distance2;
-      nearest = keyframe;
-    };
-    for (std::uint32_t i = 0; i < map_.Keyframes(other).size(); ++i) consider({other, i}, PoseOf({other, i}).path_m);
-    for (const Sighting& sighting : map_.Sightings(other)) consider(sighting.keyframe, map_.Trajectory(other)[sighting.pose].path_m);
+  for (const auto& [other, paths_m] : seen_from_m) {
+    for (auto first = paths_m.begin(), next = first; first != paths_m.end(); first = next) {
+      // Poses from which one pass saw the segments are at most so far apart that what is within reach of them is one stretch.
+      double last_m = *first;
+      while (++next != paths_m.end() && *next - last_m <= 2.0 * reach_m) last_m = *next;
+      for (const KeyframeName& keyframe : map_.KeyframesAlong(other, *first - reach_m, last_m + reach_m)) {
+        const double distance2 = (PoseOf(keyframe).T_map_sensor.translation() - place).squaredNorm();
+        if (distance2 >= nearest2) continue;
+        if (keyframe.robot == robot && IsYoung(robot, map_.Keyframes(robot)[keyframe.index].pose)) continue;
+        nearest2 = distance2;
+        nearest = keyframe;
+      }
+    }
   }
   return nearest;
 }

@@ -1,5 +1,6 @@
 #include "incremental_segmatch/descriptor_index.hpp"
 
+#include <limits>
 #include <stdexcept>
 
 #include "several_targets.hpp"
@@ -7,17 +8,20 @@
 namespace incremental_segmatch {
 namespace {
 
+constexpr float kRoom = std::numeric_limits<float>::quiet_NaN();  // for one more value; near nothing
+
 /// Sixteen floats that are computed with at once (GCC, Clang): each processor with the widest registers that it has.
 using Vector = float __attribute__((vector_size(64), may_alias));
 
-/// The first block from `block` on with a square of a distance within the bound, and the squares of its items; `blocks`
-/// if there is none. Lines hold one value of each item, the same number of lines a block.
+/// From `*block` on, looks for the first block with a square of a distance within the bound. Returns which of its items
+/// have one, a bit each, and the squares of all; 0 if there is no such block. Lines hold one value of each item, the same
+/// number of lines a block.
 SEGMATCH_SEVERAL_TARGETS
-std::size_t FindNearBlock(const float* lines, std::size_t block, std::size_t blocks, const float* query,
-                          std::size_t dimensions, float square_bound, float* squares) {
+std::uint32_t FindNearBlock(const float* lines, std::size_t blocks, const float* query, std::size_t dimensions,
+                            float square_bound, std::size_t* block, float* squares) {
   constexpr std::size_t kLanes = sizeof(Vector) / sizeof(float);
-  for (; block < blocks; ++block) {
-    const auto* const values = reinterpret_cast<const Vector*>(lines + block * dimensions * kLanes);
+  for (; *block < blocks; ++*block) {
+    const auto* const values = reinterpret_cast<const Vector*>(lines + *block * dimensions * kLanes);
     Vector sum = {};
     for (std::size_t i = 0; i < dimensions; ++i) {
       const Vector difference = values[i] - query[i];
@@ -26,9 +30,12 @@ std::size_t FindNearBlock(const float* lines, std::size_t block, std::size_t blo
     *reinterpret_cast<Vector*>(squares) = sum;
     int any = 0;
     for (std::size_t lane = 0; lane < kLanes; ++lane) any |= squares[lane] <= square_bound;
-    if (any != 0) break;
+    if (any == 0) continue;
+    std::uint32_t near = 0;
+    for (std::size_t lane = 0; lane < kLanes; ++lane) near |= std::uint32_t{squares[lane] <= square_bound} << lane;
+    return near;
   }
-  return block;
+  return 0;
 }
 
 }  // namespace
@@ -45,7 +52,11 @@ void DescriptorIndex::Insert(std::uint64_t item, const Descriptor& descriptor) {
                                 " is there already; remove it before it is inserted anew");
   }
   items_.push_back(item);
-  if (place % kBlock == 0) lanes_.resize(lanes_.size() + dimensions_);
+  if (place % kBlock == 0) {
+    Lanes room;
+    room.values.fill(kRoom);
+    lanes_.resize(lanes_.size() + dimensions_, room);
+  }
   for (std::size_t i = 0; i < dimensions_; ++i)
     lanes_[place / kBlock * dimensions_ + i].values[place % kBlock] = descriptor[static_cast<Eigen::Index>(i)];
 }
@@ -56,9 +67,11 @@ bool DescriptorIndex::Remove(std::uint64_t item) {
   if (found == places_.end()) return false;
   const std::size_t place = found->second;
   const std::size_t last = items_.size() - 1;
-  for (std::size_t i = 0; i < dimensions_; ++i)
-    lanes_[place / kBlock * dimensions_ + i].values[place % kBlock] =
-        lanes_[last / kBlock * dimensions_ + i].values[last % kBlock];
+  for (std::size_t i = 0; i < dimensions_; ++i) {
+    float* const last_value = &lanes_[last / kBlock * dimensions_ + i].values[last % kBlock];
+    lanes_[place / kBlock * dimensions_ + i].values[place % kBlock] = *last_value;
+    *last_value = kRoom;
+  }
   items_[place] = items_[last];
   places_[items_[place]] = place;
   places_.erase(found);
@@ -75,12 +88,12 @@ void DescriptorIndex::RequireValid(const Descriptor& descriptor, const std::stri
   if (!descriptor.allFinite()) throw std::invalid_argument("descriptor index: " + what + " is not finite");
 }
 
-/// The first block from `block` on that has an item within the bound, or as many as there are blocks; and the squares of
-/// its items' distances. Beyond the last item there is anything.
-std::size_t DescriptorIndex::FindNear(const Descriptor& query, float square_bound, std::size_t block,
-                                      Lanes* squares) const {
-  return FindNearBlock(lanes_.data()->values.data(), block, lanes_.size() / dimensions_, query.data(), dimensions_,
-                       square_bound, squares->values.data());
+/// From `*block` on, the first block that has items within the bound: which ones, a bit each, and the squares of all its
+/// items' distances; 0 if there is none.
+std::uint32_t DescriptorIndex::FindNear(const Descriptor& query, float square_bound, std::size_t* block,
+                                        Lanes* squares) const {
+  return FindNearBlock(lanes_.data()->values.data(), lanes_.size() / dimensions_, query.data(), dimensions_, square_bound,
+                       block, squares->values.data());
 }
 
 }  // namespace incremental_segmatch

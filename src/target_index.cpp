@@ -1,6 +1,7 @@
 #include "incremental_segmatch/target_index.hpp"
 
 #include <algorithm>
+#include <cmath>
 #include <limits>
 #include <stdexcept>
 #include <string>
@@ -8,6 +9,25 @@
 #include <utility>
 
 namespace incremental_segmatch {
+
+namespace {
+
+bool Precedes(const TargetCandidate& a, const TargetCandidate& b) {
+  return std::tie(a.distance, a.segment, a.item) < std::tie(b.distance, b.segment, b.item);
+}
+
+}  // namespace
+
+void TakeIn(const TargetCandidate& candidate, std::size_t count, std::vector<TargetCandidate>* nearest) {
+  const auto same = std::find_if(nearest->begin(), nearest->end(),
+                                 [&](const TargetCandidate& other) { return other.segment == candidate.segment; });
+  if (same != nearest->end()) {
+    if (!Precedes(candidate, *same)) return;
+    nearest->erase(same);
+  }
+  nearest->insert(std::upper_bound(nearest->begin(), nearest->end(), candidate, Precedes), candidate);
+  if (count != 0 && nearest->size() > count) nearest->pop_back();
+}
 
 void TargetIndex::Open(const SegmentKey& segment, const TargetMap& map, std::size_t released, bool others_too) {
   const TargetSegment* target = map.Find(segment);
@@ -24,7 +44,7 @@ void TargetIndex::Open(const SegmentKey& segment, const TargetMap& map, std::siz
       items.erase(present);
     }
     const SegmentView& taken = target->views[view];
-    Insert({segment, view, taken.robot, true, is_released, 0, taken.descriptor, map.CentroidMap(taken)});
+    Insert({segment, view, taken.robot, true, is_released}, taken.descriptor, map.CentroidMap(taken));
   }
   if (!index_) return;
   if (index_->size() >= rescale_at_) {
@@ -43,15 +63,20 @@ void TargetIndex::Close(const SegmentKey& segment) {
 
 void TargetIndex::Erase(std::uint64_t item) {
   index_->Remove(item);
+  const auto cell = cells_.find(CellOf(centroids_map_[item]));
+  cell->second.erase(std::find(cell->second.begin(), cell->second.end(), item));
+  if (cell->second.empty()) cells_.erase(cell);
   views_[item].live = false;
-  views_[item].descriptor = Descriptor();
 }
 
 void TargetIndex::RefreshCentroids(const TargetMap& map) {
+  cells_.clear();
   for (const auto& [segment, items] : items_) {
     const TargetSegment* target = map.Find(segment);
-    for (const std::uint64_t item : items)
-      views_[item].centroid_map = map.CentroidMap(target->views[views_[item].view]);
+    for (const std::uint64_t item : items) {
+      centroids_map_[item] = map.CentroidMap(target->views[views_[item].view]);
+      cells_[CellOf(centroids_map_[item])].push_back(item);
+    }
   }
 }
 
@@ -59,43 +84,46 @@ std::vector<TargetCandidate> TargetIndex::Nearest(const Descriptor& query, Robot
                                                   float max_distance, const std::vector<TargetCandidate>& known) const {
   if (!index_) return {};
   RequireSize(query);
-  std::vector<TargetCandidate> candidates;
+  std::vector<TargetCandidate> nearest;
+  nearest.reserve(std::min(count, segments()) + 1);
   float radius = std::min(max_distance, FarthestOf(known, query, robot, count));
   index_->Search(query.cwiseProduct(weights_), radius, [&](std::uint64_t item, float distance) {
-    __builtin_prefetch(&views_[item]);
-    candidates.push_back({item, SegmentKey(), distance});
-    if (count != 0 && candidates.size() >= 4 * count) {
-      KeepNearest(robot, count, &candidates);
-      if (candidates.size() == count) radius = candidates.back().distance;
-    }
+    if (!IsOpen(item, robot)) return radius;
+    TakeIn({item, views_[item].segment, distance}, count, &nearest);
+    if (count != 0 && nearest.size() == count) radius = nearest.back().distance;
     return radius;
   });
-  KeepNearest(robot, count, &candidates);
-  return candidates;
+  return nearest;
 }
 
-/// Leaves the most alike view of each segment, of those that are open to the robot, and of them the `count` nearest (0:
-/// all), by ascending (distance, segment). Fills in the segments.
-void TargetIndex::KeepNearest(RobotIndex robot, std::size_t count, std::vector<TargetCandidate>* candidates) const {
-  const auto closed = [&](const TargetCandidate& c) { return !IsOpen(c.item, robot); };
-  candidates->erase(std::remove_if(candidates->begin(), candidates->end(), closed), candidates->end());
-  for (TargetCandidate& candidate : *candidates) candidate.segment = views_[candidate.item].segment;
-
-  std::sort(candidates->begin(), candidates->end(), [](const TargetCandidate& a, const TargetCandidate& b) {
-    return std::tie(a.distance, a.segment, a.item) < std::tie(b.distance, b.segment, b.item);
-  });
-  std::vector<bool> seen(views_.size());
-  std::size_t kept = 0;
-  for (const TargetCandidate& candidate : *candidates) {
-    const std::uint64_t first = views_[candidate.item].first;
-    if (seen[first]) continue;
-    seen[first] = true;
-    (*candidates)[kept++] = candidate;
+std::vector<Eigen::Vector3d> TargetIndex::CentroidsAround(const Eigen::Vector3d& place_map, double radius_m,
+                                                          RobotIndex robot) const {
+  std::vector<Eigen::Vector3d> centroids_map;
+  const Eigen::Vector3d reach = Eigen::Vector3d::Constant(radius_m);
+  const Cell first = CellOf(place_map - reach), last = CellOf(place_map + reach);
+  for (auto it = cells_.lower_bound(first); it != cells_.end() && it->first.first <= last.first;) {
+    const auto [x, y] = it->first;
+    if (y < first.second || y > last.second) {  // on to the next of these rows that there is
+      it = cells_.lower_bound({y < first.second ? x : x + 1, first.second});
+      continue;
+    }
+    for (const std::uint64_t item : it->second) {
+      const Eigen::Vector3d& centroid_map = centroids_map_[item];
+      if (IsOpen(item, robot) && (centroid_map - place_map).squaredNorm() <= radius_m * radius_m)
+        centroids_map.push_back(centroid_map);
+    }
+    ++it;
   }
-  candidates->resize(count == 0 ? kept : std::min(kept, count));
+  return centroids_map;
 }
 
-void TargetIndex::RequireSize(const Descriptor& descriptor) const {
+TargetIndex::Cell TargetIndex::CellOf(const Eigen::Vector3d& centroid_map) {
+  constexpr double kCellM = 20.0;
+  return {static_cast<std::int64_t>(std::floor(centroid_map.x() / kCellM)),
+          static_cast<std::int64_t>(std::floor(centroid_map.y() / kCellM))};
+}
+
+void TargetIndex::RequireSize(const DescriptorRef& descriptor) const {
   if (descriptor.size() != weights_.size())
     throw std::invalid_argument("a descriptor of " + std::to_string(descriptor.size()) +
                                 " values does not fit the map's " + std::to_string(weights_.size()) +
@@ -111,25 +139,26 @@ float TargetIndex::FarthestOf(const std::vector<TargetCandidate>& known, const D
   for (const TargetCandidate& candidate : known) {
     if (open == count) break;
     if (!IsOpen(candidate.item, robot)) continue;
-    farthest = std::max(farthest, Distance(query, views_[candidate.item].descriptor));
+    farthest = std::max(farthest, Distance(query, descriptor(candidate.item)));
     ++open;
   }
   if (count == 0 || open < count) return std::numeric_limits<float>::infinity();
   return farthest * (1.f + kRounding) + kRounding;
 }
 
-void TargetIndex::Insert(IndexedView view) {
+void TargetIndex::Insert(const IndexedView& view, const DescriptorRef& descriptor, const Eigen::Vector3d& centroid_map) {
   if (!index_) {
-    weights_ = Descriptor::Ones(view.descriptor.size());
+    weights_ = Descriptor::Ones(descriptor.size());
     index_.emplace(static_cast<std::size_t>(weights_.size()));
   }
-  RequireSize(view.descriptor);
+  RequireSize(descriptor);
   const std::uint64_t item = views_.size();
-  std::vector<std::uint64_t>& items = items_[view.segment];
-  view.first = items.empty() ? item : views_[items.front()].first;
-  items.push_back(item);
-  index_->Insert(item, view.descriptor.cwiseProduct(weights_));
-  views_.push_back(std::move(view));
+  index_->Insert(item, descriptor.cwiseProduct(weights_));
+  items_[view.segment].push_back(item);
+  cells_[CellOf(centroid_map)].push_back(item);
+  views_.push_back(view);
+  descriptors_.insert(descriptors_.end(), descriptor.begin(), descriptor.end());
+  centroids_map_.push_back(centroid_map);
 }
 
 /// Scales by the data that are there now.
@@ -137,10 +166,10 @@ void TargetIndex::Rescale() {
   rescale_at_ = 2 * index_->size();
   const Eigen::Index dimensions = weights_.size();
   Eigen::VectorXd sum = Eigen::VectorXd::Zero(dimensions), squares = sum;
-  for (const IndexedView& view : views_) {
-    if (!view.live) continue;
-    sum += view.descriptor.cast<double>();
-    squares += view.descriptor.cast<double>().cwiseAbs2();
+  for (std::uint64_t item = 0; item < next_item(); ++item) {
+    if (!views_[item].live) continue;
+    sum += descriptor(item).cast<double>();
+    squares += descriptor(item).cast<double>().cwiseAbs2();
   }
   const double n = static_cast<double>(index_->size());
   const Eigen::VectorXd variance = squares / n - (sum / n).cwiseAbs2();
@@ -155,13 +184,16 @@ void TargetIndex::Rescale() {
 /// Forgets items that were closed: in a map that does not grow, segments come and go all the same.
 void TargetIndex::Compact() {
   ++generation_;
-  std::vector<IndexedView> views;
-  for (IndexedView& view : views_)
-    if (view.live) views.push_back(std::move(view));
   index_.emplace(static_cast<std::size_t>(weights_.size()));
-  views_.clear();
   items_.clear();
-  for (IndexedView& view : views) Insert(std::move(view));
+  cells_.clear();
+  const std::vector<IndexedView> views = std::exchange(views_, {});
+  const std::vector<float> descriptors = std::exchange(descriptors_, {});
+  const std::vector<Eigen::Vector3d> centroids_map = std::exchange(centroids_map_, {});
+  const auto size = static_cast<std::size_t>(weights_.size());
+  for (std::size_t item = 0; item < views.size(); ++item)
+    if (views[item].live)
+      Insert(views[item], Eigen::Map<const Descriptor>(&descriptors[item * size], weights_.size()), centroids_map[item]);
 }
 
 }  // namespace incremental_segmatch

@@ -174,6 +174,19 @@ std::optional<KeyframeName> TargetMap::KeyframeOf(const SegmentView& view) const
   return KeyframeName{view.robot, static_cast<std::uint32_t>(keyframe - robot.keyframes.begin() - 1)};
 }
 
+std::vector<KeyframeName> TargetMap::KeyframesAlong(RobotIndex robot_index, double from_m, double to_m) const {
+  const Robot& robot = robots_.at(robot_index);
+  const auto is_before = [&](const auto& marked, double path_m) { return robot.trajectory[marked.pose].path_m < path_m; };
+  const auto is_along = [&](const auto& marked) { return robot.trajectory[marked.pose].path_m <= to_m; };
+  std::vector<KeyframeName> found;
+  auto keyframe = std::lower_bound(robot.keyframes.begin(), robot.keyframes.end(), from_m, is_before);
+  for (; keyframe != robot.keyframes.end() && is_along(*keyframe); ++keyframe)
+    found.push_back({robot_index, static_cast<std::uint32_t>(keyframe - robot.keyframes.begin())});
+  auto sighting = std::lower_bound(robot.sightings.begin(), robot.sightings.end(), from_m, is_before);
+  for (; sighting != robot.sightings.end() && is_along(*sighting); ++sighting) found.push_back(sighting->keyframe);
+  return found;
+}
+
 std::size_t TargetMap::memory_bytes() const {
   constexpr std::size_t kTreeNodeOverhead = 4 * sizeof(void*);
   std::size_t bytes = sizeof(*this) + robots_.capacity() * sizeof(Robot);

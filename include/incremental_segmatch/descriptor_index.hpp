@@ -44,7 +44,7 @@ class DescriptorIndex {
   };
 
   void RequireValid(const Descriptor& descriptor, const std::string& what) const;
-  std::size_t FindNear(const Descriptor& query, float square_bound, std::size_t block, Lanes* squares) const;
+  std::uint32_t FindNear(const Descriptor& query, float square_bound, std::size_t* block, Lanes* squares) const;
 
   /// No square of a distance within the radius is larger, whatever root and square are rounded to.
   static float SquareBound(float radius) {
@@ -53,7 +53,7 @@ class DescriptorIndex {
   }
 
   std::size_t dimensions_;
-  std::vector<Lanes> lanes_;          ///< block after block, `dimensions_` each; the last one may have room
+  std::vector<Lanes> lanes_;          ///< block after block, `dimensions_` each; room in the last one is NaN
   std::vector<std::uint64_t> items_;  ///< in the order of the blocks
   std::unordered_map<std::uint64_t, std::size_t> places_;  ///< index of an item in items_
 };
@@ -63,17 +63,14 @@ void DescriptorIndex::Search(const Descriptor& query, float radius, Visit&& visi
   RequireValid(query, "a query");
   float square_bound = SquareBound(radius);
   Lanes squares;
-  for (std::size_t block = 0;; ++block) {
-    block = FindNear(query, square_bound, block, &squares);
-    const std::size_t first = block * kBlock;
-    if (first >= items_.size()) return;
-    for (std::size_t i = 0; i < kBlock && first + i < items_.size(); ++i) {
-      if (!(squares.values[i] <= square_bound)) continue;
-      const float distance = std::sqrt(squares.values[i]);
+  for (std::size_t block = 0; std::uint32_t near = FindNear(query, square_bound, &block, &squares); ++block) {
+    for (; near != 0; near &= near - 1) {
+      const auto lane = static_cast<std::size_t>(__builtin_ctz(near));
+      const float distance = std::sqrt(squares.values[lane]);
       if (!(distance <= radius)) continue;
-      radius = visit(items_[first + i], distance);
-      square_bound = SquareBound(radius);
+      radius = visit(items_[block * kBlock + lane], distance);
     }
+    square_bound = SquareBound(radius);
   }
 }
 

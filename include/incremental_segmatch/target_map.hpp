@@ -148,6 +148,10 @@ class TargetMap {
   /// The key frame that was kept or sighted last when a view was taken; none if there was none yet. O(log key frames).
   std::optional<KeyframeName> KeyframeOf(const SegmentView& view) const;
 
+  /// The key frames that were kept, then those that were sighted, between two distances along a robot's path (m), both
+  /// included, in order of its trajectory. O(log key frames, and what is found).
+  std::vector<KeyframeName> KeyframesAlong(RobotIndex robot, double from_m, double to_m) const;
+
   /// Memory held, about. O(map).
   std::size_t memory_bytes() const;
 

@@ -34,9 +34,8 @@ std::optional<Ranked> RankOf(const SegmentKey& segment, const Descriptor& query,
   float own = std::numeric_limits<float>::infinity();
   for (std::uint64_t item = 0; item < index.next_item(); ++item) {
     if (!index.IsOpen(item, robot)) continue;
-    const IndexedView& view = index.view(item);
-    views.emplace_back(index.Distance(query, view.descriptor), view.segment);
-    if (view.segment == segment) own = std::min(own, views.back().first);
+    views.emplace_back(index.Distance(query, index.descriptor(item)), index.view(item).segment);
+    if (views.back().second == segment) own = std::min(own, views.back().first);
   }
   if (own == std::numeric_limits<float>::infinity()) return std::nullopt;
   std::set<SegmentKey> before;

@@ -62,7 +62,7 @@ class RandomMap {
       EXPECT_EQ(view.segment, found[i].segment);
       const SegmentView& seen = map_.Find(view.segment)->views.at(view.view);
       EXPECT_NEAR(index_.Distance(query, seen.descriptor), found[i].distance, 1e-4f);
-      EXPECT_LT((view.centroid_map - map_.CentroidMap(seen)).norm(), 1e-9);
+      EXPECT_LT((index_.centroid_map(found[i].item) - map_.CentroidMap(seen)).norm(), 1e-9);
     }
 
     // What was found before, for any query, spares work and changes nothing.
@@ -76,6 +76,28 @@ class RandomMap {
     known_ = found;
     known_generation_ = index_.generation();
   }
+
+  /// Compares the centroids around a place with those of all open views.
+  void ExpectCentroidsAround() {
+    const RobotIndex robot = Chance(0.5) ? kOwner : kOther;
+    const Eigen::Vector3d place_map = RandomPlace();
+    const double radius_m = Chance(0.1) ? 1e6 : 60.0 * Unit();
+    std::vector<Eigen::Vector3d> expected;
+    for (std::uint64_t item = 0; item < index_.next_item(); ++item) {
+      if (!index_.IsOpen(item, robot)) continue;
+      const IndexedView& view = index_.view(item);
+      const Eigen::Vector3d centroid_map = map_.CentroidMap(map_.Find(view.segment)->views.at(view.view));
+      if ((centroid_map - place_map).norm() <= radius_m) expected.push_back(centroid_map);
+    }
+    std::vector<Eigen::Vector3d> found = index_.CentroidsAround(place_map, radius_m, robot);
+    ASSERT_EQ(found.size(), expected.size());
+    found_around_ += found.size();
+    const auto precedes = [](const Eigen::Vector3d& a, const Eigen::Vector3d& b) { return a.x() < b.x(); };
+    std::sort(found.begin(), found.end(), precedes);
+    std::sort(expected.begin(), expected.end(), precedes);
+    for (std::size_t i = 0; i < found.size(); ++i) EXPECT_EQ(found[i], expected[i]);
+  }
+  std::size_t found_around() const { return found_around_; }
 
   void ExpectBounded() const {
     std::size_t views = 0;
@@ -101,6 +123,7 @@ class RandomMap {
       descriptor[i] = static_cast<float>((i + 1) * std::normal_distribution<double>()(random_));
     return descriptor;
   }
+  Eigen::Vector3d RandomPlace() { return {200.0 * (Unit() - 0.5), 200.0 * (Unit() - 0.5), Unit()}; }
   SegmentKey RandomKey() {
     return std::next(map_.segments().begin(), static_cast<long>(Below(map_.segments().size())))->first;
   }
@@ -109,7 +132,7 @@ class RandomMap {
     const SegmentKey key{kOwner, ++last_id_};
     for (std::size_t views = 1 + Below(3); views > 0; --views) {
       Pose T_odom_sensor = Pose::Identity();
-      T_odom_sensor.translation() = Eigen::Vector3d(Unit(), Unit(), 0.0);
+      T_odom_sensor.translation() = RandomPlace();
       SegmentView view;
       view.pose = map_.AddPose(kOwner, ++stamp_ns_, T_odom_sensor);
       view.size = static_cast<std::uint32_t>(Below(100));
@@ -138,7 +161,7 @@ class RandomMap {
   void Correct() {
     StampedPose pose;
     pose.stamp_ns = 1 + static_cast<StampNs>(Below(static_cast<std::size_t>(stamp_ns_)));
-    pose.T_frame_sensor.translation() = Eigen::Vector3d(10.0 * Unit(), 10.0 * Unit(), 0.0);
+    pose.T_frame_sensor.translation() = RandomPlace();
     map_.CorrectTrajectory(kOwner, {pose});
     index_.RefreshCentroids(map_);
   }
@@ -152,6 +175,7 @@ class RandomMap {
   std::size_t keep_;
   std::vector<TargetCandidate> known_;
   std::uint64_t known_generation_ = 0;
+  std::size_t found_around_ = 0;
   mutable std::size_t largest_ = 0;
 };
 
@@ -171,7 +195,55 @@ TEST(TargetIndex, RefusesDescriptorsOfOtherSettings) {
   EXPECT_EQ(index.Nearest(Descriptor::Ones(3), kOwner, 1, 1e9f).size(), 1u);
 }
 
+// As long as nothing is scaled, distances between whole numbers are exact, and many are equal.
+TEST(TargetIndex, EquallyNearSegmentsComeByNameAndTheirViewsAsTheyWereOpened) {
+  std::size_t ties = 0;
+  for (unsigned seed = 0; seed < 1000; ++seed) {
+    SCOPED_TRACE("seed " + std::to_string(seed));
+    std::mt19937 random(seed);
+    const auto random_descriptor = [&] {
+      return Descriptor(Descriptor::NullaryExpr(3, [&] { return static_cast<float>(random() % 3); }));
+    };
+    TargetMap map{TargetMapParameters()};
+    map.RobotByName("owner");
+    map.AddPose(kOwner, 1, Pose::Identity());
+    TargetIndex index;
+    for (int view_number = 0; view_number < 30; ++view_number) {
+      const SegmentKey key{kOwner, static_cast<SegmentId>(1 + random() % 12)};
+      SegmentView view;
+      view.descriptor = random_descriptor();
+      index.Close(key);
+      map.UpdateSegment(key, view, true, 1);
+      index.Open(key, map, 1 + random() % 4, true);
+      if (index.generation() != 0) break;
+
+      const Descriptor query = random_descriptor();
+      const RobotIndex robot = random() % 2 == 0 ? kOwner : kOther;
+      const std::size_t count = random() % 8;
+      std::map<SegmentKey, std::pair<float, std::uint64_t>> nearest;  // of each segment, item by item
+      for (std::uint64_t item = 0; item < index.next_item(); ++item) {
+        if (!index.IsOpen(item, robot)) continue;
+        const std::pair<float, std::uint64_t> view_at{(index.descriptor(item) - query).norm(), item};
+        const auto [it, is_new] = nearest.emplace(index.view(item).segment, view_at);
+        ties += !is_new && it->second.first == view_at.first;
+        it->second = std::min(it->second, view_at);
+      }
+      std::vector<std::tuple<float, SegmentKey, std::uint64_t>> expected;
+      for (const auto& [segment, view_at] : nearest) expected.emplace_back(view_at.first, segment, view_at.second);
+      std::sort(expected.begin(), expected.end());
+      if (count != 0 && expected.size() > count) expected.resize(count);
+      std::vector<std::tuple<float, SegmentKey, std::uint64_t>> found;
+      for (const TargetCandidate& candidate : index.Nearest(query, robot, count, 1e9f))
+        found.emplace_back(candidate.distance, candidate.segment, candidate.item);
+      ASSERT_EQ(found, expected);
+      for (std::size_t i = 1; i < found.size(); ++i) ties += std::get<0>(found[i]) == std::get<0>(found[i - 1]);
+    }
+  }
+  EXPECT_GT(ties, 10000u);
+}
+
 TEST(TargetIndex, NearestIsThatOfAllOpenViewsOverRandomSequences) {
+  std::size_t found_around = 0;
   for (unsigned seed = 0; seed < 1000; ++seed) {
     SCOPED_TRACE("seed " + std::to_string(seed));
     RandomMap map(seed);
@@ -179,10 +251,13 @@ TEST(TargetIndex, NearestIsThatOfAllOpenViewsOverRandomSequences) {
     for (int step = 0; step < steps; ++step) {
       map.Step();
       if (step % 10 == 0) map.ExpectNearest();
+      if (step % 10 == 0) map.ExpectCentroidsAround();
       map.ExpectBounded();
       if (::testing::Test::HasFailure()) return;
     }
+    found_around += map.found_around();
   }
+  EXPECT_GT(found_around, 10000u);
 }
 
 }  // namespace

@@ -4,7 +4,10 @@
 
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <cmath>
+#include <functional>
+#include <limits>
 #include <memory>
 #include <random>
 
@@ -140,7 +143,9 @@ TEST(BackEnd, WhatLiesOnEachOtherAfterACorrectionIsOneObject) {
 /// corrected at every closure.
 class Laps {
  public:
-  explicit Laps(unsigned seed) : random_(seed), back_end_(std::make_unique<BackEnd>(Parameters())) {
+  explicit Laps(unsigned seed) : Laps(seed, Parameters()) {}
+  Laps(unsigned seed, const BackEndParameters& parameters)
+      : random_(seed), back_end_(std::make_unique<BackEnd>(parameters)) {
     for (int i = 0; i < 150; ++i) {
       const double angle = 2.0 * M_PI * Unit(), radius_m = kRadius_m + 30.0 * (Unit() - 0.5);
       landmarks_.push_back({{radius_m * std::cos(angle), radius_m * std::sin(angle), 3.0 * Unit()}, Look(2.0), 0});
@@ -159,6 +164,22 @@ class Laps {
     deltas_ = 0;
   }
 
+  /// From here on a tracked segment changes with this probability in a step, and each step is checked before the map is
+  /// corrected.
+  void ChangeSegments(double probability, std::function<void(const Laps&, const BackEndStep&)> check) {
+    change_ = probability;
+    check_ = std::move(check);
+  }
+  /// The tracked segments, as they are now.
+  const std::map<SegmentId, Descriptor>& tracked() const { return tracked_; }
+
+  static BackEndParameters Parameters() {
+    BackEndParameters parameters;
+    parameters.refinement.enabled = false;  // there are no scans
+    parameters.matching.nearest = 3;  // so few that many a landmark is not recognised, but only found to lie there
+    return parameters;
+  }
+
   /// Returns the steps with a closure.
   std::size_t DriveOneLap() {
     std::size_t closures = 0;
@@ -175,12 +196,6 @@ class Laps {
   static constexpr double kRadius_m = 60.0;
   static constexpr int kStepsALap = 75;
 
-  static BackEndParameters Parameters() {
-    BackEndParameters parameters;
-    parameters.refinement.enabled = false;  // there are no scans
-    parameters.matching.nearest = 3;  // so few that many a landmark is not recognised, but only found to lie there
-    return parameters;
-  }
   double Unit() { return std::uniform_real_distribution<double>(0.0, 1.0)(random_); }
   Descriptor Look(double scale) {
     Descriptor look(6);
@@ -209,10 +224,18 @@ class Laps {
         const Eigen::Vector3d noise_m = 0.05 * Eigen::Vector3d(Unit(), Unit(), Unit());
         state.centroid_odom = T_odom_world * (landmark.position + noise_m);
         state.descriptor = landmark.look + Look(0.5);
+        tracked_[landmark.tracked_as] = state.descriptor;
         delta.changed.push_back(state);
       } else if (!is_seen && landmark.tracked_as != 0) {
         delta.retired.push_back({landmark.tracked_as, RetirementCause::kLeft});
+        tracked_.erase(landmark.tracked_as);
         landmark.tracked_as = 0;
+      } else if (is_seen && check_ && Unit() < change_) {
+        SegmentState state = State(landmark.tracked_as, Unit() < 0.5);
+        state.centroid_odom = T_odom_world * landmark.position;
+        state.descriptor = landmark.look + Look(0.5);
+        tracked_[landmark.tracked_as] = state.descriptor;
+        delta.changed.push_back(state);
       }
     }
     ++step_;
@@ -220,7 +243,9 @@ class Laps {
     truth.stamp_ns = delta.stamp_ns;
     truth.T_frame_sensor = T_world_sensor;
     truth_.push_back(truth);
-    const bool is_closure = back_end_->Process(delta).closure.has_value();
+    const BackEndStep step = back_end_->Process(delta);
+    if (check_) check_(*this, step);
+    const bool is_closure = step.closure.has_value();
     if (is_closure && back_end_->parameters().mode == Mode::kLoopClosure) back_end_->CorrectTrajectory("robot", truth_);
     return is_closure;
   }
@@ -228,6 +253,9 @@ class Laps {
   std::mt19937 random_;
   std::unique_ptr<BackEnd> back_end_;
   std::vector<Landmark> landmarks_;
+  std::map<SegmentId, Descriptor> tracked_;
+  double change_ = 0.0;
+  std::function<void(const Laps&, const BackEndStep&)> check_;
   std::vector<StampedPose> truth_;
   int step_ = 0;
   std::uint64_t deltas_ = 0;  // of this back end's life
@@ -251,6 +279,89 @@ TEST(BackEnd, TheMapStopsGrowingAfterTheFirstLap) {
       EXPECT_LE(map.segments().size(), segments + 3);
       EXPECT_LE(map.Keyframes(0).size(), keyframes + 10);
       EXPECT_LT(laps.back_end().targets().next_item(), 20 * laps.landmarks()) << "closed items are forgotten";
+    }
+  }
+}
+
+/// Compares the candidates of all tracked segments with the nearest of all open views, each looked at.
+void ExpectNearestCandidates(const Laps& laps, const BackEndStep& step) {
+  const TargetIndex& targets = laps.back_end().targets();
+  std::map<SegmentId, std::map<SegmentKey, float>> found;
+  for (const SegmentMatch& match : step.candidates) found[match.local.id][match.target] = match.descriptor_distance;
+  for (const auto& [id, descriptor] : laps.tracked()) {
+    std::map<SegmentKey, float> nearest;  // by segment
+    for (std::uint64_t item = 0; item < targets.next_item(); ++item) {
+      if (!targets.IsOpen(item, 0)) continue;
+      const auto entry = nearest.emplace(targets.view(item).segment, std::numeric_limits<float>::infinity()).first;
+      entry->second = std::min(entry->second, targets.Distance(descriptor, targets.descriptor(item)));
+    }
+    std::vector<std::pair<float, SegmentKey>> expected;
+    for (const auto& [segment, distance] : nearest) expected.emplace_back(distance, segment);
+    std::sort(expected.begin(), expected.end());
+    expected.resize(std::min<std::size_t>(expected.size(), 3));
+    ASSERT_EQ(found[id].size(), expected.size());
+    for (const auto& [distance, segment] : expected) {
+      ASSERT_EQ(found[id].count(segment), 1u);
+      EXPECT_NEAR(found[id][segment], distance, 1e-4f);
+    }
+  }
+}
+
+TEST(BackEnd, CandidatesAreTheNearestOpenSegmentsWhateverChanged) {
+  for (unsigned seed = 0; seed < 3; ++seed) {
+    SCOPED_TRACE("seed " + std::to_string(seed));
+    BackEndParameters parameters = Laps::Parameters();
+    parameters.matching.requery_distance = 0.0;
+    parameters.forgetting.missed_visits = 0;  // nothing is closed after it was matched
+    Laps laps(seed, parameters);
+    laps.ChangeSegments(0.3, ExpectNearestCandidates);
+    for (int lap = 1; lap <= 4 && !::testing::Test::HasFailure(); ++lap) laps.DriveOneLap();
+    EXPECT_GT(laps.back_end().targets().generation(), 1u);
+  }
+}
+
+/// Compares a closure's key frame with the nearest of all that were kept or sighted within reach along the path of where
+/// the matched segments, of one view each, were seen from.
+void ExpectNearestKeyframe(const Laps& laps, const BackEndStep& step) {
+  const BackEnd& back_end = laps.back_end();
+  const TargetMap& map = back_end.map();
+  const std::vector<TrajectoryPose>& trajectory = map.Trajectory(0);
+  for (const std::optional<Closure>& closure : {step.closure, step.refused}) {
+    if (!closure) continue;
+    const Eigen::Vector3d place = closure->T_map_odom * trajectory.back().T_odom_sensor.translation();
+    StampNs nearest_ns = 0;
+    double nearest_m = std::numeric_limits<double>::infinity();
+    const auto consider = [&](std::uint32_t seen_at, const KeyframeName& keyframe) {
+      const TrajectoryPose& pose = trajectory[map.Keyframes(0)[keyframe.index].pose];
+      const bool is_young = trajectory.back().stamp_ns - pose.stamp_ns <= 60 * kSecond ||
+                            trajectory.back().path_m - pose.path_m <= back_end.parameters().matching.min_path_m;
+      const double distance_m = (pose.T_map_sensor.translation() - place).norm();
+      if (is_young || distance_m >= nearest_m) return;
+      for (const SegmentMatch& match : closure->matches) {
+        const double seen_from_m = map.PoseOf(map.Find(match.target)->views.at(0)).path_m;
+        if (std::abs(trajectory[seen_at].path_m - seen_from_m) > back_end.parameters().keyframes.reach_m) continue;
+        nearest_m = distance_m;
+        nearest_ns = pose.stamp_ns;
+        return;
+      }
+    };
+    for (std::uint32_t i = 0; i < map.Keyframes(0).size(); ++i) consider(map.Keyframes(0)[i].pose, {0, i});
+    for (const Sighting& sighting : map.Sightings(0)) consider(sighting.pose, sighting.keyframe);
+    EXPECT_EQ(closure->stamp_target_ns, nearest_ns);
+  }
+}
+
+TEST(BackEnd, AClosureLeadsToTheNearestKeyframeOfAllAlongThePassesThatSawItsSegments) {
+  for (unsigned seed = 0; seed < 3; ++seed) {
+    for (const double reach_m : {3.0, 12.0, 50.0}) {
+      SCOPED_TRACE("seed " + std::to_string(seed) + ", reach " + std::to_string(reach_m));
+      BackEndParameters parameters = Laps::Parameters();
+      parameters.target_map.max_views = 1;
+      parameters.keyframes.reach_m = reach_m;
+      Laps laps(seed, parameters);
+      laps.ChangeSegments(0.1, ExpectNearestKeyframe);
+      laps.DriveOneLap();
+      for (int lap = 2; lap <= 4; ++lap) EXPECT_GT(laps.DriveOneLap(), 30u) << "of 75 steps";
     }
   }
 }

@@ -4,6 +4,7 @@
 
 #include <cmath>
 #include <limits>
+#include <random>
 #include <stdexcept>
 
 namespace incremental_segmatch {
@@ -52,6 +53,43 @@ TEST(TargetMap, NamesRobotsInTheOrderInWhichTheyCome) {
   EXPECT_EQ(map.robots(), 2u);
   EXPECT_EQ(map.RobotName(1), "a");
   EXPECT_THROW(map.RobotName(2), std::out_of_range);
+}
+
+TEST(TargetMap, KeyframesAlongAPathAreThoseOfAllThatLieThere) {
+  std::size_t kept = 0, sighted = 0;
+  for (unsigned seed = 0; seed < 1000; ++seed) {
+    SCOPED_TRACE("seed " + std::to_string(seed));
+    std::mt19937 random(seed);
+    TargetMap map({});
+    for (const char* name : {"a", "b"}) map.RobotByName(name);
+    double x_m = 0.0;
+    for (int i = 0; i < 60; ++i) {
+      const RobotIndex robot = random() % 2;
+      x_m += static_cast<double>(random() % 3);  // it may stand still
+      map.AddPose(robot, i, MakePose(x_m, 0, 0, 0));
+      if (random() % 2 == 0) map.AddKeyframe(robot, nullptr);
+      const RobotIndex other = random() % 2;
+      if (random() % 2 == 0 && !map.Keyframes(other).empty())
+        map.AddSighting(robot, {other, static_cast<std::uint32_t>(random() % map.Keyframes(other).size())});
+    }
+    for (RobotIndex robot = 0; robot < 2; ++robot) {
+      // Whole metres, as the path: what lies at an end is along it.
+      const double from_m = static_cast<double>(random() % 80) - 10.0, to_m = from_m + static_cast<double>(random() % 30);
+      const auto is_along = [&](std::uint32_t pose) {
+        const double path_m = map.Trajectory(robot)[pose].path_m;
+        return from_m <= path_m && path_m <= to_m;
+      };
+      std::vector<KeyframeName> expected;
+      for (std::uint32_t i = 0; i < map.Keyframes(robot).size(); ++i)
+        if (is_along(map.Keyframes(robot)[i].pose)) expected.push_back({robot, i});
+      kept += expected.size();
+      for (const Sighting& sighting : map.Sightings(robot))
+        if (is_along(sighting.pose)) expected.push_back(sighting.keyframe), ++sighted;
+      EXPECT_EQ(map.KeyframesAlong(robot, from_m, to_m), expected);
+    }
+  }
+  EXPECT_GT(kept, 1000u);
+  EXPECT_GT(sighted, 1000u);
 }
 
 TEST(TargetMap, KeepsAtMostOneKeyframeAndSightingAPose) {
