@@ -3,55 +3,94 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <optional>
 #include <stdexcept>
 #include <string>
-#include <utility>
+
+#include "several_targets.hpp"
 
 namespace incremental_segmatch {
 namespace {
 
 constexpr int kColumns = 180;
-constexpr int kRows = 60;
-constexpr float kLowest = -0.7854f;  // elevation of the lowest row's lower edge: -45 to 45 degrees
+constexpr int kRows = 60;  // from -45 to 45 degrees of elevation
+constexpr int kStride = kColumns + 2;  // on either side, the column of the other side once more; and an empty row below and above
 constexpr float kPi = 3.14159265f;
 constexpr int kMinReturns = 2;  // cells around a point that must have returns
 
-struct Direction {
-  int row;
-  int column;
-};
+/// Arc tangent of a value between -1 and 1, to rounding: Abramowitz and Stegun, 4.4.49.
+inline float Arctangent(float t) {
+  constexpr float kCoefficients[] = {-0.0161657367f, 0.0429096138f,  -0.0752896400f, 0.1065626393f,
+                                     -0.1420889944f, 0.1999355085f, -0.3333314528f, 1.f};
+  const float t2 = t * t;
+  float sum = 0.0028662257f;
+  for (const float coefficient : kCoefficients) sum = sum * t2 + coefficient;
+  return sum * t;
+}
 
-std::optional<Direction> DirectionOf(const Eigen::Vector3f& p) {
-  const float elevation = std::atan2(p.z(), p.head<2>().norm());
-  const int row = static_cast<int>(std::floor((elevation - kLowest) * (kRows / (-2.f * kLowest))));
-  if (row < 0 || row >= kRows) return std::nullopt;
-  const int column = static_cast<int>((std::atan2(p.y(), p.x()) + kPi) * (kColumns / (2.f * kPi)));
-  return Direction{row, column % kColumns};
+/// The ranges of points in the image's sensor frame (x, y, z each), and the cells that they lie in: 0, in the empty row below, for
+/// those above or below all rows.
+SEGMATCH_SEVERAL_TARGETS
+void Locate(const float* points, std::size_t count, std::int32_t* cells, float* ranges) {
+  constexpr float kLeast = std::numeric_limits<float>::min();
+  for (std::size_t i = 0; i < count; ++i) {
+    const float x = points[3 * i], y = points[3 * i + 1], z = points[3 * i + 2];
+    const float horizontal2 = x * x + y * y;
+    ranges[i] = std::sqrt(horizontal2 + z * z);
+
+    const float slope = z / std::max(std::sqrt(horizontal2), kLeast);
+    const float elevation = Arctangent(std::min(1.f, std::max(-1.f, slope)));
+    const auto row = static_cast<std::int32_t>((elevation + 0.25f * kPi) * (kRows / (0.5f * kPi)));
+
+    const float shorter = std::min(std::abs(x), std::abs(y)), longer = std::max(std::abs(x), std::abs(y));
+    const float from_axis = Arctangent(shorter / std::max(longer, kLeast));
+    const float from_x_axis = std::abs(y) > std::abs(x) ? 0.5f * kPi - from_axis : from_axis;
+    const float azimuth = std::copysign(x < 0.f ? kPi - from_x_axis : from_x_axis, y);
+    const auto column = static_cast<std::int32_t>((azimuth + kPi) * (kColumns / (2.f * kPi)));
+
+    const std::int32_t cell = (1 + std::min(row, kRows - 1)) * kStride + 1 + (column < kColumns ? column : 0);
+    cells[i] = std::abs(slope) < 1.f ? cell : 0;
+  }
 }
 
 }  // namespace
 
-RangeImage::RangeImage(const Points& scan_sensor) : cells_(kRows * kColumns) {
-  for (const Eigen::Vector3f& p : scan_sensor) {
-    const std::optional<Direction> direction = DirectionOf(p);
-    if (!direction) continue;
-    Cell& cell = cells_[static_cast<std::size_t>(direction->row * kColumns + direction->column)];
-    const float range = p.norm();
+RangeImage::RangeImage(const Points& scan_sensor) : cells_((kRows + 2) * kStride) {
+  const Located located = LocateAll(scan_sensor);
+  for (std::size_t i = 0; i < scan_sensor.size(); ++i) {
+    if (located.cells[i] == 0) continue;
+    const float range = located.ranges[i];
+    Cell& cell = cells_[static_cast<std::size_t>(located.cells[i])];
     cell.nearest = cell.farthest == 0.f ? range : std::min(cell.nearest, range);
     cell.farthest = std::max(cell.farthest, range);
   }
+  for (auto row = cells_.begin(); row != cells_.end(); row += kStride) {
+    row[0] = row[kColumns];
+    row[kColumns + 1] = row[1];
+  }
+}
+
+RangeImage::Located RangeImage::LocateAll(const Points& points_sensor) {
+  Located located{std::vector<std::int32_t>(points_sensor.size()), std::vector<float>(points_sensor.size())};
+  if (!points_sensor.empty())
+    Locate(points_sensor.front().data(), points_sensor.size(), located.cells.data(), located.ranges.data());
+  return located;
 }
 
 Sight RangeImage::Look(const Eigen::Vector3f& point_sensor, float tolerance_m) const {
-  const std::optional<Direction> direction = DirectionOf(point_sensor);
-  if (!direction) return Sight::kUnknown;
-  const float range = point_sensor.norm();
+  std::int32_t cell;
+  float range;
+  Locate(point_sensor.data(), 1, &cell, &range);
+  return LookAround(cell, range, tolerance_m);
+}
+
+/// What the cell and the eight around it say of something at a range.
+Sight RangeImage::LookAround(std::int32_t center, float range, float tolerance_m) const {
+  if (center == 0) return Sight::kUnknown;
   int returns = 0;
   bool is_confirmed = false, is_behind_all = true;
-  for (int row = std::max(0, direction->row - 1); row <= std::min(kRows - 1, direction->row + 1); ++row) {
-    for (int step = kColumns - 1; step <= kColumns + 1; ++step) {
-      const Cell& cell = cells_[static_cast<std::size_t>(row * kColumns + (direction->column + step) % kColumns)];
+  for (const std::int32_t row : {center - kStride, center, center + kStride}) {
+    for (std::int32_t i = row - 1; i <= row + 1; ++i) {
+      const Cell& cell = cells_[static_cast<std::size_t>(i)];
       if (cell.farthest == 0.f) continue;
       ++returns;
       is_confirmed = is_confirmed || (cell.nearest - tolerance_m <= range && range <= cell.farthest + tolerance_m);
@@ -69,12 +108,15 @@ FreeSpaceCounts RangeImage::Compare(const Points& points, const Pose& T_image_po
   const float tolerance = static_cast<float>(parameters.tolerance_m + slack_m);
   const float min_height = static_cast<float>(parameters.min_height_m);
   const float max_range = static_cast<float>(parameters.max_range_m);
+  Points high_sensor;
+  high_sensor.reserve(points.size());
+  for (const Eigen::Vector3f& point : points)
+    if (!(point.z() < min_height)) high_sensor.push_back(R * point + t);
+  const Located located = LocateAll(high_sensor);
   FreeSpaceCounts counts;
-  for (const Eigen::Vector3f& point : points) {
-    if (point.z() < min_height) continue;
-    const Eigen::Vector3f p = R * point + t;
-    if (p.norm() > max_range) continue;
-    const Sight sight = Look(p, tolerance);
+  for (std::size_t i = 0; i < high_sensor.size(); ++i) {
+    if (located.ranges[i] > max_range) continue;
+    const Sight sight = LookAround(located.cells[i], located.ranges[i], tolerance);
     counts.confirmed += sight == Sight::kConfirmed;
     counts.seen_through += sight == Sight::kSeenThrough;
   }

@@ -3,6 +3,7 @@
 #pragma once
 
 #include <cstddef>
+#include <cstdint>
 #include <vector>
 
 #include "incremental_segmatch/types.hpp"
@@ -64,7 +65,15 @@ class RangeImage {
     float nearest = 0.f;
     float farthest = 0.f;  // 0: no return
   };
-  std::vector<Cell> cells_;
+  // Of points in the sensor's frame: the cell that each lies in, 0 for none, and its range.
+  struct Located {
+    std::vector<std::int32_t> cells;
+    std::vector<float> ranges;
+  };
+  static Located LocateAll(const Points& points_sensor);
+  Sight LookAround(std::int32_t cell, float range, float tolerance_m) const;
+
+  std::vector<Cell> cells_;  // row by row from below, with those at the seam twice and an empty row at either end
 };
 
 /// Throws std::invalid_argument naming the parameter that is out of range.
