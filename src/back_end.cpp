@@ -206,7 +206,9 @@ BackEndStep BackEnd::AttemptRecognition(RobotIndex robot, StageTimer timer) {
 
 void BackEnd::CorrectTrajectory(const std::string& robot, const std::vector<StampedPose>& T_map_sensor) {
   if (!IsLoopClosure()) throw std::invalid_argument("the map is fixed in localization: its trajectories can't be corrected");
-  map_.CorrectTrajectory(RobotByName(robot), T_map_sensor);
+  const RobotIndex index = RobotByName(robot);
+  robots_[index].is_corrected = true;
+  map_.CorrectTrajectory(index, T_map_sensor);
   index_.RefreshCentroids(map_);
   MergeDuplicates();
 }
@@ -586,6 +588,7 @@ void BackEnd::AcceptClosure(RobotIndex robot, const Closure& closure) {
   }
   const RobotIndex target_robot = closure.matches.front().target.robot;
   if (robots_[robot].frame != robots_[target_robot].frame) JoinFrames(robot, target_robot, closure.T_map_odom);
+  if (!robots_[robot].is_corrected) map_.Anchor(robot, closure.T_map_odom);
 }
 
 /// The first closure between robots of different frames aligns their maps: every robot of the query's frame moves.

@@ -103,6 +103,13 @@ void TargetMap::CorrectTrajectory(RobotIndex robot_index, const std::vector<Stam
   robot.T_map_odom = corrections.back().T_map_odom;
 }
 
+void TargetMap::Anchor(RobotIndex robot, const Pose& T_map_odom) {
+  if (!T_map_odom.matrix().allFinite()) {
+    throw std::invalid_argument("target map: where robot '" + RobotName(robot) + "' is to go on is not finite");
+  }
+  robots_.at(robot).T_map_odom = T_map_odom;
+}
+
 void TargetMap::UpdateSegment(const SegmentKey& key, SegmentView view, bool keep_last, StampNs stamp_ns) {
   if (view.robot >= robots_.size() || view.pose >= robots_[view.robot].trajectory.size()) {
     throw std::invalid_argument("target map: a view of segment " + std::to_string(key.id) +

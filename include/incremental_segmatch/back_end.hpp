@@ -242,6 +242,7 @@ class BackEnd {
     std::string name;
     RobotIndex frame = 0;  // robots with the same value share a map frame
     bool started = false;
+    bool is_corrected = false;  // from outside: until then each closure tells where it goes on
     std::uint64_t sequence = 0;
     StampNs stamp_ns = 0;
     double path_m = 0.0;

@@ -102,6 +102,8 @@ class TargetMap {
   std::optional<Pose> OdometryAt(RobotIndex robot, StampNs stamp_ns) const;
   /// T_map_odom of a robot now.
   const Pose& T_map_odom(RobotIndex robot) const { return robots_.at(robot).T_map_odom; }
+  /// Sets it for the poses that come from now on. Throws std::invalid_argument if it is not finite.
+  void Anchor(RobotIndex robot, const Pose& T_map_odom);
   /// A corrected trajectory, in any order: poses at corrected stamps are taken as they are; the others follow the
   /// nearest earlier corrected pose rigidly, those before the first the first. A corrected pose between two stamps of
   /// the trajectory counts from where odometry, interpolated, had the sensor then; one before or after the trajectory

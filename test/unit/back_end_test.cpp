@@ -140,7 +140,7 @@ TEST(BackEnd, WhatLiesOnEachOtherAfterACorrectionIsOneObject) {
 }
 
 /// Landmarks along a ring road, seen as new segments on every lap, with odometry that drifts and a map that is
-/// corrected at every closure.
+/// corrected at every closure, unless fewer corrections are ordered.
 class Laps {
  public:
   explicit Laps(unsigned seed) : Laps(seed, Parameters()) {}
@@ -152,6 +152,7 @@ class Laps {
     }
   }
 
+  static constexpr int kStepsALap = 75;
   std::size_t landmarks() const { return landmarks_.size(); }
   const BackEnd& back_end() const { return *back_end_; }
 
@@ -163,6 +164,9 @@ class Laps {
     for (Landmark& landmark : landmarks_) landmark.tracked_as = 0;
     deltas_ = 0;
   }
+
+  /// Corrects the map so many times more, and then no more.
+  void LastCorrections(std::size_t corrections) { corrections_ = corrections; }
 
   /// From here on a tracked segment changes with this probability in a step, and each step is checked before the map is
   /// corrected.
@@ -194,7 +198,6 @@ class Laps {
     SegmentId tracked_as;  // 0: out of sight
   };
   static constexpr double kRadius_m = 60.0;
-  static constexpr int kStepsALap = 75;
 
   double Unit() { return std::uniform_real_distribution<double>(0.0, 1.0)(random_); }
   Descriptor Look(double scale) {
@@ -246,7 +249,10 @@ class Laps {
     const BackEndStep step = back_end_->Process(delta);
     if (check_) check_(*this, step);
     const bool is_closure = step.closure.has_value();
-    if (is_closure && back_end_->parameters().mode == Mode::kLoopClosure) back_end_->CorrectTrajectory("robot", truth_);
+    if (is_closure && back_end_->parameters().mode == Mode::kLoopClosure && corrections_ > 0) {
+      --corrections_;
+      back_end_->CorrectTrajectory("robot", truth_);
+    }
     return is_closure;
   }
 
@@ -257,6 +263,7 @@ class Laps {
   double change_ = 0.0;
   std::function<void(const Laps&, const BackEndStep&)> check_;
   std::vector<StampedPose> truth_;
+  std::size_t corrections_ = std::numeric_limits<std::size_t>::max();
   int step_ = 0;
   std::uint64_t deltas_ = 0;  // of this back end's life
   SegmentId last_id_ = 0;
@@ -281,6 +288,35 @@ TEST(BackEnd, TheMapStopsGrowingAfterTheFirstLap) {
       EXPECT_LT(laps.back_end().targets().next_item(), 20 * laps.landmarks()) << "closed items are forgotten";
     }
   }
+}
+
+TEST(BackEnd, ARobotThatNobodyCorrectsGoesOnWhereItWasRecognised) {
+  for (unsigned seed = 0; seed < 3; ++seed) {
+    SCOPED_TRACE("seed " + std::to_string(seed));
+    Laps laps(seed);
+    laps.LastCorrections(0);
+    laps.DriveOneLap();
+    const TargetMap& map = laps.back_end().map();
+    for (int lap = 2; lap <= 8; ++lap) {
+      SCOPED_TRACE("lap " + std::to_string(lap));
+      EXPECT_GT(laps.DriveOneLap(), 65u) << "of 75 steps";
+      const auto place = [&](int step) { return map.Trajectory(0)[static_cast<std::size_t>(step)].T_map_sensor.translation(); };
+      constexpr int kHalf = Laps::kStepsALap / 2;
+      EXPECT_LT((place((lap - 1) * Laps::kStepsALap + kHalf) - place(kHalf)).norm(), 0.3) << "odometry has 0.75 m more on every lap";
+      EXPECT_LE(map.segments().size(), 3 * laps.landmarks());
+    }
+  }
+}
+
+TEST(BackEnd, ARobotThatWasCorrectedGoesOnFromThere) {
+  Laps laps(1);
+  laps.LastCorrections(1);
+  laps.DriveOneLap();
+  laps.DriveOneLap();
+  const Pose T_map_odom = laps.back_end().map().T_map_odom(0);
+  EXPECT_FALSE(T_map_odom.isApprox(Pose::Identity(), 1e-6)) << "there was a closure, and a correction";
+  EXPECT_GT(laps.DriveOneLap(), 30u);
+  EXPECT_EQ(laps.back_end().map().T_map_odom(0).matrix(), T_map_odom.matrix()) << "and closures after it";
 }
 
 /// Compares the candidates of all tracked segments with the nearest of all open views, each looked at.

@@ -161,6 +161,19 @@ TEST(TargetMap, CorrectedPosesAreTakenExactlyAndOthersFollow) {
   EXPECT_TRUE(map.Trajectory(0).back().T_map_sensor.isApprox(T_map_odom * MakePose(11, 0, 0, 0), 1e-12));
 }
 
+TEST(TargetMap, AnAnchorHoldsForThePosesAfterIt) {
+  TargetMap map = MapOfOneRobot();
+  const Pose T_map_odom = MakePose(3, -4, 1, 0.2);
+  map.Anchor(0, T_map_odom);
+  for (int i = 0; i < 10; ++i) EXPECT_EQ(map.Trajectory(0)[i].T_map_sensor.matrix(), MakePose(i, 0, 0, 0.1 * i).matrix());
+  map.AddPose(0, 10000, MakePose(11, 0, 0, 0));
+  EXPECT_TRUE(map.Trajectory(0).back().T_map_sensor.isApprox(T_map_odom * MakePose(11, 0, 0, 0), 1e-12));
+  Pose broken = Pose::Identity();
+  broken.translation().x() = std::numeric_limits<double>::quiet_NaN();
+  EXPECT_THROW(map.Anchor(0, broken), std::invalid_argument);
+  EXPECT_EQ(map.T_map_odom(0).matrix(), T_map_odom.matrix());
+}
+
 TEST(TargetMap, ACorrectionBetweenTwoStampsCountsFromInterpolatedOdometry) {
   TargetMap map = MapOfOneRobot();
   const Pose correction = MakePose(3, 4, 5, 0.3);

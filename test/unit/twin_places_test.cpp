@@ -37,6 +37,7 @@ class Robot {
     std::vector<Accepted> accepted;  ///< with this step: settled ones, and its own
   };
 
+  /// Corrected to where odometry has it: the passes lie apart in the map, and only the street deceives.
   std::vector<Step> Drive(double from_m, double to_m) {
     std::vector<Step> steps;
     for (const StreetRobot::Sight& sight : robot_.Pass(from_m, to_m)) {
@@ -52,6 +53,7 @@ class Robot {
             {T_world_query.translation().x(), (truth.inverse() * closure.T_target_query).translation().norm() < 0.5});
       }
       steps.push_back(std::move(step));
+      back_end_.CorrectTrajectory(sight.delta.robot, {{sight.delta.stamp_ns, sight.delta.T_odom_sensor}});
     }
     return steps;
   }
