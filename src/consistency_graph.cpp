@@ -356,7 +356,7 @@ class Partition {
     int dy, dz;
   };
 
-  static constexpr int kReach = 2;     ///< rows to a square of side b + tolerance
+  static constexpr int kReach = 2;    ///< rows to a square of side b + tolerance
   static constexpr int kColumns = 8;  ///< columns to the height of a row
 
   Index RowAt(double offset_m) const { return static_cast<Index>(std::max(offset_m, 0.0) * rows_per_m_); }

@@ -418,7 +418,8 @@ const std::vector<Parameter>& Table() {
       NUMBER(back_end.forgetting.missed_visits, AtLeast(0),
              "a segment that was not seen on so many visits in a row leaves the map; 0: none do"),
       NUMBER(back_end.forgetting.min_views, AtLeast(0),
-             "what a visit adds to a known place leaves the map after it, if fewer views of it were kept than these, and than max_views; 0 or 1: nothing does"),
+             "what a visit adds to a known place leaves the map after it, if fewer views of it were kept than these, and than "
+             "max_views; 0 or 1: nothing does"),
 
       NUMBER(back_end.history.length_m, AtLeast(0), "so much of path behind the robot speaks for or against a place"),
       NUMBER(back_end.history.spacing_m, Above(0), "path between the scans of it that are kept"),

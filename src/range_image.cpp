@@ -13,7 +13,8 @@ namespace {
 
 constexpr int kColumns = 180;
 constexpr int kRows = 60;  // from -45 to 45 degrees of elevation
-constexpr int kStride = kColumns + 2;  // on either side, the column of the other side once more; and an empty row below and above
+/// From one row to the next: on either side is the column of the other side once more. Below and above is an empty row.
+constexpr int kStride = kColumns + 2;
 constexpr float kPi = 3.14159265f;
 constexpr int kMinReturns = 2;  // cells around a point that must have returns
 

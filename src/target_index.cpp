@@ -9,7 +9,6 @@
 #include <utility>
 
 namespace incremental_segmatch {
-
 namespace {
 
 bool Precedes(const TargetCandidate& a, const TargetCandidate& b) {

@@ -79,7 +79,7 @@ TEST(RangeImage, LeavesOutWhatIsLowFarOrWithinTheSlack) {
   EXPECT_EQ(RangeImage(Points()).Compare(Wall(10.0), Pose::Identity(), 0.0, AllHeights()).seen_through, 0u);
 }
 
-/// The same, with angles by the standard library, and every return looked at.
+/// What an image says of a point, with angles by the standard library, and every return looked at.
 Sight LookSlowly(const Points& scan, const Eigen::Vector3f& p, float tolerance_m) {
   const auto cell_of = [](const Eigen::Vector3f& q) {
     const double elevation = std::atan2(q.z(), std::hypot(q.x(), q.y())), azimuth = std::atan2(q.y(), q.x());
